@@ -1,0 +1,1 @@
+"""From the workstation to the car: ONNX artifacts, map tiles, synthetic recordings."""

@@ -1,0 +1,7 @@
+"""`python -m eqrt` is the `eqrt` command."""
+
+import sys
+
+from eqrt.cli import main
+
+sys.exit(main())

@@ -1,0 +1,102 @@
+"""The `eqrt` command: a table of subcommands, each imported only when it is the one asked for.
+
+A subcommand is a module with `add_arguments(parser)` and `run(args) -> int`; its docstring's first
+line is its help. Exit status: 0 done, 1 the user can fix it, 2 wrong usage or a missing extra.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.metadata
+import sys
+from collections.abc import Sequence
+
+from eqrt.core.errors import EqrtError, UsageError
+
+COMMANDS = {
+    "demo": ("eqrt.runtime.demo", "see it work: recorded traffic over CAN, predicted and scored"),
+    "serve": ("eqrt.runtime.serve", "predict from a CAN bus, publish on CAN and as datagrams"),
+    "play": ("eqrt.runtime.play", "put a recorded log on a CAN bus"),
+    "replay": ("eqrt.runtime.replay", "run the service on a recorded log, offline, repeatably"),
+    "tile": ("eqrt.runtime.tile_command", "look at a map tile, or build one"),
+    "train": ("eqrt.training.train", "train a predictor (extra: train)"),
+    "export": ("eqrt.export.command", "turn a checkpoint into an ONNX artifact (extra: export)"),
+    "encode": ("eqrt.export.encode", "turn a recorded scenario into a CAN log and its tile"),
+}
+EXTRA_OF = {  # third-party module -> the extra that brings it
+    "torch": "train",
+    "safetensors": "train",
+    "rich": "train",
+    "onnx": "export",
+    "onnxscript": "export",
+    "lanelet2": "maps",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand and return the exit status."""
+    args_list = list(sys.argv[1:] if argv is None else argv)
+    name = args_list[0] if args_list else None
+    try:
+        if name in COMMANDS:
+            return _run_command(name, args_list[1:])
+        return _top_level(args_list)
+    except EqrtError as error:
+        print(f"eqrt: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return 130  # 128 + SIGINT, the shell's convention
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader has gone; there is nobody to tell
+        return 1
+
+
+def _run_command(name: str, argv: list[str]) -> int:
+    module_name, summary = COMMANDS[name]
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        extra = EXTRA_OF.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        raise missing_extra(f"eqrt {name}", error.name or "", extra) from error
+    parser = argparse.ArgumentParser(
+        prog=f"eqrt {name}", description=summary, allow_abbrev=False
+    )
+    module.add_arguments(parser)
+    return int(module.run(parser.parse_args(argv)))
+
+
+def missing_extra(what: str, module: str, extra: str) -> UsageError:
+    """The error for a feature whose optional packages are not installed."""
+    return UsageError(
+        f"{what} needs the package {module!r}, which is not installed; "
+        f"install it with: pip install 'eqrt[{extra}]'"
+    )
+
+
+def _top_level(argv: list[str]) -> int:
+    width = max(map(len, COMMANDS))
+    listing = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items())
+    parser = argparse.ArgumentParser(
+        prog="eqrt",
+        description="Motion prediction from CAN object lists and a lane map, on a 2-core CPU.",
+        epilog=f"commands:\n{listing}\n\n`eqrt COMMAND --help` says more.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+        usage="eqrt [--help] [--version] COMMAND ...",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"eqrt {importlib.metadata.version('eqrt')}"
+    )
+    if not argv:
+        parser.print_help()
+        return 2
+    parser.parse_known_args(argv)
+    close = ", ".join(COMMANDS)
+    raise UsageError(f"there is no command {argv[0]!r}; the commands are {close}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

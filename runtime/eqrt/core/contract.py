@@ -1,0 +1,127 @@
+"""What a model file promises: sizes, units, names (contract version 1).
+
+The contract travels twice: inside the ONNX file as metadata, and beside it as `contract.json` for
+runtimes that cannot read ONNX metadata. docs/design.md holds the tensor table in words.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+
+from eqrt.core.errors import ContractError
+
+SCHEMA = 1
+"""Version of this contract; changes when the inputs or their meaning change."""
+
+UNITS = {"position": "m", "time": "s", "frame": "tile: x east, y north"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelContract:
+    """Sizes and units the exported graph was built for. B (targets) is the only dynamic axis."""
+
+    name: str
+    """Which network this is, for example `eqrt-ngsim`."""
+    version: str
+    """MAJOR.MINOR.PATCH of the artifact; MAJOR = inputs or meaning changed."""
+    num_agents: int
+    """N, the target first, padded."""
+    history_steps: int
+    """T, the last step is now."""
+    num_centerlines: int
+    """Q, padded."""
+    centerline_points: int
+    """L points per centerline."""
+    horizon_steps: int
+    """H, the first step is dt after now."""
+    num_modes: int
+    """K, most probable first."""
+    dt_s: float
+    """Time between steps; the same for history and horizon."""
+
+    def __post_init__(self) -> None:
+        for name in _SIZES:
+            if not 1 <= getattr(self, name) <= _MAX_SIZE:
+                raise ContractError(
+                    f"model contract: {name} is {getattr(self, name)}, "
+                    f"expected 1 to {_MAX_SIZE}; re-export the model"
+                )
+        if not 0.0 < self.dt_s <= 1.0:
+            raise ContractError(f"model contract: dt_s is {self.dt_s}, expected above 0 to 1 s")
+
+    @property
+    def inputs(self) -> dict[str, tuple[str, tuple[int | str, ...]]]:
+        """Input name -> (element type, shape), in order."""
+        n, t, q, points = (
+            self.num_agents,
+            self.history_steps,
+            self.num_centerlines,
+            self.centerline_points,
+        )
+        return {
+            "history": ("float32", ("B", n, t, 2)),
+            "history_valid": ("bool", ("B", n, t)),
+            "heading": ("float32", ("B", 2)),
+            "centerlines": ("float32", ("B", q, points, 2)),
+            "centerlines_valid": ("bool", ("B", q, points)),
+        }
+
+    @property
+    def outputs(self) -> dict[str, tuple[str, tuple[int | str, ...]]]:
+        """Output name -> (element type, shape), in order."""
+        return {
+            "trajectories": ("float32", ("B", self.num_modes, self.horizon_steps, 2)),
+            "probabilities": ("float32", ("B", self.num_modes)),
+        }
+
+    def to_json(self) -> str:
+        """The text of `contract.json`, and of the `eqrt_contract` metadata entry."""
+        tensors = {
+            side: {name: {"type": kind, "shape": list(shape)} for name, (kind, shape) in spec}
+            for side, spec in (("inputs", self.inputs.items()), ("outputs", self.outputs.items()))
+        }
+        return json.dumps({"schema": SCHEMA, **asdict(self), "units": UNITS, **tensors}, indent=2)
+
+    @classmethod
+    def from_json(cls, text: str, where: str) -> ModelContract:
+        """Parse `to_json`'s text; `where` names the file in errors.
+
+        Raises ContractError if it is not JSON, is another schema, or a field is missing or wrong.
+        """
+        try:
+            values = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ContractError(f"{where}: the model contract is not JSON ({error})") from error
+        if not isinstance(values, Mapping):
+            raise ContractError(f"{where}: the model contract is not a JSON object")
+        if values.get("schema") != SCHEMA:
+            raise ContractError(
+                f"{where}: model contract schema {values.get('schema')} is not supported (this "
+                f"runtime speaks {SCHEMA}); re-export the model with this version of eqrt"
+            )
+        return cls(**{field.name: _typed(values, field.name, where) for field in fields(cls)})
+
+
+_SIZES = (
+    "num_agents",
+    "history_steps",
+    "num_centerlines",
+    "centerline_points",
+    "horizon_steps",
+    "num_modes",
+)
+_MAX_SIZE = 1024  # far above any sensible model, low enough that a bad file cannot exhaust memory
+
+
+def _typed(values: Mapping[str, object], name: str, where: str) -> object:
+    kind: type | tuple[type, ...] = int if name in _SIZES else str
+    if name == "dt_s":
+        kind = (int, float)
+    value = values.get(name)
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise ContractError(
+            f"{where}: model contract field {name!r} is {value!r}; re-export the model"
+        )
+    return value

@@ -1,0 +1,36 @@
+"""Errors a user can fix: one line that says what, where, what was found and what to do.
+
+`eqrt.cli` prints them without a traceback. Programming errors stay `ValueError`/`TypeError`.
+"""
+
+
+class EqrtError(Exception):
+    """Base of every error the user can fix; the command ends with `exit_code`."""
+
+    exit_code = 1
+
+
+class UsageError(EqrtError):
+    """The command line asks for something that does not exist, or an extra is not installed."""
+
+    exit_code = 2
+
+
+class ContractError(EqrtError):
+    """A model file does not keep the contract this version speaks."""
+
+
+class TileError(EqrtError):
+    """A map or tile file cannot be used."""
+
+
+class ProfileError(EqrtError):
+    """A sensor profile, or the DBC it names, cannot be used."""
+
+
+class BusError(EqrtError):
+    """A CAN channel cannot be opened or written."""
+
+
+class LogError(EqrtError):
+    """A recorded log cannot be read."""

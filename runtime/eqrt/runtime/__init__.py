@@ -1,0 +1,1 @@
+"""What ships to the car: CAN in, tracks, predictions out. Never imports torch or onnx."""

@@ -1,0 +1,1 @@
+"""The workstation: data, networks and training."""
