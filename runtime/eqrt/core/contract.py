@@ -9,11 +9,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 from eqrt.core.errors import ContractError
 
 SCHEMA = 1
 """Version of this contract; changes when the inputs or their meaning change."""
+
+METADATA_KEY = "eqrt_contract"
+"""The ONNX metadata entry that holds the contract."""
 
 UNITS = {"position": "m", "time": "s", "frame": "tile: x east, y north"}
 
@@ -101,7 +105,8 @@ class ModelContract:
                 f"{where}: model contract schema {values.get('schema')} is not supported (this "
                 f"runtime speaks {SCHEMA}); re-export the model with this version of eqrt"
             )
-        return cls(**{field.name: _typed(values, field.name, where) for field in fields(cls)})
+        arguments: dict[str, Any] = {f.name: _typed(values, f.name, where) for f in fields(cls)}
+        return cls(**arguments)
 
 
 _SIZES = (

@@ -26,12 +26,14 @@ class Pose2:
 
     def apply(self, points: Float64) -> Float64:
         """Points (..., 2) in metres, from `src` to `dst`."""
-        return self.rotate(points) + (self.x_m, self.y_m)
+        moved: Float64 = self.rotate(points) + np.array([self.x_m, self.y_m])
+        return moved
 
     def rotate(self, vectors: Float64) -> Float64:
         """Free vectors (..., 2), from `src` to `dst`: turned, not moved."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        return vectors @ np.array([[cos, sin], [-sin, cos]])
+        turned: Float64 = vectors @ np.array([[cos, sin], [-sin, cos]])
+        return turned
 
     def inverse(self) -> Pose2:
         """`src_from_dst`."""

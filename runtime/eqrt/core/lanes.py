@@ -1,17 +1,27 @@
-"""The lane map: centerlines, how they connect, and a grid to find them by place.
+"""The lane map: centerlines and how they connect.
 
 Everything is flat arrays, so that a tile file is this structure written out. Map frame, metres.
-Axes: P points of all lanes, M lanes, S successor links, G grid cells.
+Axes: P points of all lanes, M lanes, S successor links.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eqrt.core.errors import TileError
+
+Float64 = NDArray[np.float64]
+
+SPACING_M = 2.0
+"""Distance between the points of a centerline, about."""
+MAX_COORDINATE_M = 131_072.0
+"""float32 resolves 8 mm out to here; a map farther from its origin is refused."""
 NO_LANE = -1
 """`left` or `right` where there is no neighbour."""
 
@@ -63,3 +73,84 @@ class LaneMap:
     def successors_of(self, lane: int) -> NDArray[np.int32]:
         """Lane indices that follow `lane`."""
         return self.successor[self.successor_start[lane] : self.successor_start[lane + 1]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lane:
+    """One lane on its way into a `LaneMap`: references are source ids, known or not."""
+
+    lane_id: int
+    centerline: Float64
+    """(n, 2) metres, map frame, in driving direction."""
+    successors: Sequence[int] = ()
+    left: int | None = None
+    """Neighbour with the same direction."""
+    right: int | None = None
+    lane_type: LaneType = LaneType.UNKNOWN
+    speed_limit_mps: float = math.nan
+
+
+def build_lane_map(lanes: Iterable[Lane], where: str) -> LaneMap:
+    """Flatten `lanes`, in their order; `where` names the source in errors.
+
+    A lane id that comes again is dropped, and so are references to lanes that are not there.
+    Raises TileError if no lane is left, or one has no length or lies too far from the origin.
+    """
+    unique: dict[int, Lane] = {}
+    for lane in lanes:
+        _check_centerline(lane, where)
+        unique.setdefault(lane.lane_id, lane)
+    if not unique:
+        raise TileError(f"{where}: no lanes for vehicles; choose a map with drivable lanes")
+    index = {lane_id: i for i, lane_id in enumerate(unique)}
+    kept = list(unique.values())
+    successors = [[index[i] for i in dict.fromkeys(lane.successors) if i in index] for lane in kept]
+    return LaneMap(
+        points=np.concatenate([lane.centerline for lane in kept]).astype(np.float32),
+        lane_start=_starts([len(lane.centerline) for lane in kept]),
+        lane_id=np.array(list(unique), np.int64),
+        successor_start=_starts([len(row) for row in successors]),
+        successor=np.array([i for row in successors for i in row], np.int32),
+        left=_neighbours([lane.left for lane in kept], index),
+        right=_neighbours([lane.right for lane in kept], index),
+        lane_type=np.array([lane.lane_type for lane in kept], np.uint8),
+        speed_limit_mps=np.array([lane.speed_limit_mps for lane in kept], np.float32),
+    )
+
+
+def middle_line(left: Float64, right: Float64) -> Float64:
+    """(n, 2) line halfway between two bounds (l, 2), (r, 2) that run the same way.
+
+    Both bounds are walked at equal fractions of their length, about `SPACING_M` at a time.
+    """
+    length_m = (arclength(left)[-1] + arclength(right)[-1]) / 2.0
+    fraction = np.linspace(0.0, 1.0, max(2, round(length_m / SPACING_M) + 1))
+    return (_at_fraction(left, fraction) + _at_fraction(right, fraction)) / 2.0
+
+
+def arclength(line: Float64) -> Float64:
+    """(n,) metres along a polyline (n, 2) from its first point."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+
+
+def _at_fraction(line: Float64, fraction: Float64) -> Float64:
+    along = arclength(line)
+    return np.stack([np.interp(fraction * along[-1], along, axis) for axis in line.T], axis=-1)
+
+
+def _check_centerline(lane: Lane, where: str) -> None:
+    if not np.abs(lane.centerline).max(initial=0.0) <= MAX_COORDINATE_M:
+        raise TileError(
+            f"{where}: lane {lane.lane_id} lies more than {MAX_COORDINATE_M / 1e3:.0f} km from "
+            "the map's origin (or is not finite); choose an origin within the map"
+        )
+    if len(lane.centerline) < 2 or arclength(lane.centerline)[-1] < 0.01:
+        raise TileError(f"{where}: lane {lane.lane_id} is shorter than 1 cm; repair the map")
+
+
+def _starts(counts: Sequence[int]) -> NDArray[np.int32]:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def _neighbours(ids: Iterable[int | None], index: dict[int, int]) -> NDArray[np.int32]:
+    return np.array([NO_LANE if i is None else index.get(i, NO_LANE) for i in ids], np.int32)

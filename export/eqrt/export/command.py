@@ -1,0 +1,35 @@
+"""`eqrt export`: turn a checkpoint into an artifact."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from eqrt.export.artifact import write_artifact
+from eqrt.training.checkpoint import load_checkpoint
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `eqrt export`."""
+    parser.add_argument(
+        "checkpoint", type=Path, help="model.safetensors of `eqrt train`"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the artifact")
+    parser.add_argument(
+        "--model-version", default="1.0.0", help="default 1.0.0"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export, verify, and say what was written."""
+    model, card = load_checkpoint(args.checkpoint)
+    contract = model.config.contract(card.name, args.model_version)
+    error = write_artifact(model, contract, card, args.out)
+    size = (args.out / "model.onnx").stat().st_size
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    print(f"artifact       {args.out}")
+    print(f"model          {contract.name} {contract.version}, {parameters} parameters")
+    print(f"model.onnx     {size / 1e6:.2f} MB")
+    print(f"verified       PyTorch and the file agree within {1e3 * error:.3f} mm on every vector")
+    print(f"licence        {card.license}")
+    return 0

@@ -1,0 +1,126 @@
+"""Named scenes that every artifact carries as test vectors, with known answers to give.
+
+A gently curving road of three lanes, the target in the middle one, cars around it: enough for the
+map, the neighbours and every mask to matter. Nothing here is random, so the vectors are the same on
+every machine. Tile frame, metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.contract import ModelContract
+from eqrt.core.frames import Pose2
+from eqrt.core.scene import Scene
+
+RADIUS_M = 220.0
+LANE_WIDTH_M = 3.5
+TURNED = Pose2(-431.7, 212.3, 2.1)
+"""Where the turned and shifted twin of a scene lies."""
+FAR = Pose2(700.0, -700.0, 0.0)
+"""The edge of a tile: 1 km from its origin."""
+
+Float32 = NDArray[np.float32]
+
+
+def named_scenes(contract: ModelContract) -> dict[str, Scene]:
+    """One scene (B = 1) per name, for the sizes of `contract`."""
+    driving = road_scene(contract, speed_mps=12.0)
+    stopped = road_scene(contract, speed_mps=0.0)
+    west = move(road_scene(contract, speed_mps=9.0), Pose2(20.0, 5.0, np.pi))
+    return {
+        "driving": driving,
+        "driving_turned": move(driving, TURNED),
+        "driving_far": move(driving, FAR),
+        "crawling": road_scene(contract, speed_mps=0.6),
+        "stopped": replace(stopped, heading=np.array([[1.0, 0.0]], np.float32)),
+        "stopped_no_heading": stopped,
+        "stopped_turned": move(stopped, TURNED),
+        "heading_pi": replace(west, heading=np.array([[-1.0, 0.0]], np.float32)),
+        "no_map": without_map(driving),
+        "lone_agent": without_neighbours(driving),
+        "lone_agent_no_map_stopped": without_neighbours(without_map(stopped)),
+        "seen_once": seen_for(driving, 1),
+        "seen_half": seen_for(driving, contract.history_steps // 2),
+        "nan_under_false": nan_where_invalid(seen_for(driving, contract.history_steps // 2)),
+    }
+
+
+def road_scene(contract: ModelContract, speed_mps: float) -> Scene:
+    """The target at the origin heading along +x at `speed_mps`, others ahead, behind and beside."""
+    agents, lines = contract.num_agents, contract.num_centerlines
+    time = (np.arange(contract.history_steps) - contract.history_steps + 1) * contract.dt_s
+    gap = np.array([((i + 1) // 2) * 14.0 * (-1) ** (i + 1) for i in range(agents)])
+    lane = np.array([(0, 1, 0, -1)[i % 4] for i in range(agents)])
+    speed = speed_mps * (1.0 + 0.05 * np.sin(np.arange(agents)))
+    speed[0] = speed_mps
+    station = gap[:, None] + speed[:, None] * time  # (N, T)
+    history = on_road(station, lane[:, None] * LANE_WIDTH_M)
+    along = np.linspace(-10.0, 90.0, contract.centerline_points)
+    offset = np.array([((q + 1) // 2) * (-1) ** q for q in range(lines)]) * LANE_WIDTH_M
+    centerlines = on_road(np.broadcast_to(along, (lines, len(along))), offset[:, None])
+    valid = np.ones(centerlines.shape[:2], np.bool_)
+    valid[lines // 2 :, -contract.centerline_points // 3 :] = False  # some lanes end early
+    return Scene(
+        history=history[None].astype(np.float32),
+        history_valid=np.ones((1, agents, contract.history_steps), np.bool_),
+        heading=np.zeros((1, 2), np.float32),
+        centerlines=centerlines[None].astype(np.float32),
+        centerlines_valid=valid[None],
+        origin=np.zeros(2),
+    )
+
+
+def on_road(station: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions (..., 2) `station` metres along a left-hand bend, `offset` metres to its left."""
+    angle = station / RADIUS_M
+    radius = RADIUS_M - offset
+    return np.stack([radius * np.sin(angle), RADIUS_M - radius * np.cos(angle)], axis=-1)
+
+
+def move(scene: Scene, tile_from_scene: Pose2) -> Scene:
+    """The same scene, turned and shifted."""
+
+    def points(values: Float32) -> Float32:
+        return tile_from_scene.apply(values.astype(np.float64)).astype(np.float32)
+
+    heading = tile_from_scene.rotate(scene.heading.astype(np.float64)).astype(np.float32)
+    return replace(
+        scene,
+        history=points(scene.history),
+        centerlines=points(scene.centerlines),
+        heading=heading,
+    )
+
+
+def without_map(scene: Scene) -> Scene:
+    """No centerline is valid."""
+    return replace(scene, centerlines_valid=np.zeros_like(scene.centerlines_valid))
+
+
+def without_neighbours(scene: Scene) -> Scene:
+    """Only the target was ever seen."""
+    valid = scene.history_valid.copy()
+    valid[:, 1:] = False
+    return replace(scene, history_valid=valid)
+
+
+def seen_for(scene: Scene, steps: int) -> Scene:
+    """Every agent was seen in the last `steps` steps only."""
+    valid = scene.history_valid.copy()
+    valid[:, :, :-steps] = False
+    return replace(scene, history_valid=valid)
+
+
+def nan_where_invalid(scene: Scene) -> Scene:
+    """NaN wherever a mask is False: it must change nothing."""
+    return replace(
+        scene,
+        history=np.where(scene.history_valid[..., None], scene.history, np.float32(np.nan)),
+        centerlines=np.where(
+            scene.centerlines_valid[..., None], scene.centerlines, np.float32(np.nan)
+        ),
+    )

@@ -1,0 +1,59 @@
+"""Prediction by physics alone: the baseline every figure is compared with, and the fallback.
+
+Both are straight applications of a target's own history, in whatever frame it is given in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+BASELINE_STEPS = 5
+"""Velocity of the baseline is the mean of the last half second."""
+
+
+def constant_velocity(history: Float64, valid: Bool, horizon_steps: int) -> Float64:
+    """Histories (B, T, 2), valid (B, T) -> positions (B, H, 2): the mean recent velocity goes on.
+
+    The velocity is the displacement between the last seen step and the first seen of the
+    BASELINE_STEPS before it (or, where none of those was seen, the newest seen before them); a
+    target seen once stands still. One step of the result is one step of the history.
+    """
+    batch, steps = valid.shape
+    rows = np.arange(batch)
+    last = steps - 1 - np.argmax(valid[:, ::-1], axis=1)
+    first = _velocity_start(valid, last)
+    spent = np.maximum(last - first, 1)[:, None]
+    velocity = (history[rows, last] - history[rows, first]) / spent  # (B, 2) per step
+    ahead = np.arange(1, horizon_steps + 1)[None, :, None]
+    return np.asarray(history[rows, last][:, None] + velocity[:, None] * ahead)
+
+
+def constant_turn(
+    position: Float64,
+    velocity: Float64,
+    turn_rate_rad_s: Float64,
+    horizon_steps: int,
+    dt_s: float,
+) -> Float64:
+    """Constant turn rate and velocity (CTRV): (B, 2), (B, 2) m/s, (B,) -> positions (B, H, 2)."""
+    time = np.arange(1, horizon_steps + 1)[None] * dt_s  # (1, H)
+    turned = turn_rate_rad_s[:, None] * time
+    along = time * np.sinc(turned / np.pi)  # sin(wt) / w, defined at w = 0
+    across = time * np.sinc(turned / (2 * np.pi)) * np.sin(turned / 2)  # (1 - cos(wt)) / w
+    left = np.stack([-velocity[:, 1], velocity[:, 0]], axis=-1)
+    return np.asarray(
+        position[:, None] + along[..., None] * velocity[:, None] + across[..., None] * left[:, None]
+    )
+
+
+def _velocity_start(valid: Bool, last: NDArray[np.intp]) -> NDArray[np.intp]:
+    steps = np.arange(valid.shape[1])[None]
+    before = valid & (steps < last[:, None])
+    within = before & (steps >= last[:, None] - BASELINE_STEPS)
+    earlier = valid.shape[1] - 1 - np.argmax(before[:, ::-1], axis=1)
+    start = np.where(within.any(axis=1), np.argmax(within, axis=1), earlier)
+    return np.asarray(np.where(before.any(axis=1), start, last))

@@ -1,0 +1,260 @@
+"""The paper's predictor: an equivariant network over agents, plus a canonicalised map.
+
+    history ----> geometric features (turn) ----+--> P feature-learning layers --> decoder
+         \\-----> pattern features (do not) -----+          ^
+    centerlines -> canonical frame -> transformer -> fused into pattern; lane vectors into geometric
+
+Inputs and outputs are contract version 1. Inside, lengths are in units of UNIT_M, and positions are
+relative to the target's last seen position, so nothing depends on where the tile lies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from eqrt.core.contract import ModelContract
+from eqrt.training.canonical import (
+    canonical_from_tile,
+    heading_vector,
+    last_valid,
+    masked,
+)
+from eqrt.training.layers import (
+    FeatureLearning,
+    GatedVectorMlp,
+    InteractionReasoning,
+    cross,
+    dot,
+    length,
+    mlp,
+)
+from eqrt.training.map_encoder import PointTransformer, point_directions
+
+UNIT_M = 10.0
+"""Network units: features of traffic (speeds per second, gaps) are about 1."""
+SLOPE_STEPS = (5, 10, 20)
+"""Velocity is fitted over the last half, one and two seconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelConfig:
+    """What the network is; travels in the checkpoint."""
+
+    num_agents: int
+    history_steps: int
+    num_centerlines: int
+    centerline_points: int
+    horizon_steps: int
+    num_modes: int
+    dt_s: float
+    layers: int
+    """P, feature-learning layers."""
+    channels: int
+    """C, vectors per agent."""
+    width: int
+    """D, pattern width."""
+    categories: int
+    """R, interaction categories."""
+    token_width: int
+    """Width of a map token, a multiple of `heads`."""
+    heads: int
+    pointers: int
+    """Lane vectors handed from the map to the target."""
+
+    def contract(self, name: str, version: str) -> ModelContract:
+        """The contract an artifact of this network promises."""
+        return ModelContract(
+            name=name,
+            version=version,
+            num_agents=self.num_agents,
+            history_steps=self.history_steps,
+            num_centerlines=self.num_centerlines,
+            centerline_points=self.centerline_points,
+            horizon_steps=self.horizon_steps,
+            num_modes=self.num_modes,
+            dt_s=self.dt_s,
+        )
+
+
+class EquivariantPredictor(nn.Module):
+    """Rotated map, point transformer, EqMotion layers (row 6 of the paper's table)."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.motion = MotionInit(config)
+        self.map = PointTransformer(config.token_width, config.heads, config.pointers, config.width)
+        self.fuse = nn.Linear(config.channels + config.pointers, config.channels, bias=False)
+        self.interaction = InteractionReasoning(config.channels, config.width, config.categories)
+        self.layers = nn.ModuleList(
+            FeatureLearning(config.channels, config.width, config.categories)
+            for _ in range(config.layers)
+        )
+        self.decoder = Decoder(config)
+
+    def forward(
+        self,
+        history: Tensor,
+        history_valid: Tensor,
+        heading: Tensor,
+        centerlines: Tensor,
+        centerlines_valid: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Contract version 1: trajectories (B, K, H, 2) tile frame, probabilities (B, K)."""
+        history = masked(history, history_valid)
+        last = last_valid(history, history_valid)  # (B, N, 2)
+        origin = last[:, 0]  # (B, 2) the target, now
+        motion = self.motion(history, history_valid, last)
+        geometric, pattern = self.fuse_map(motion, origin, heading, centerlines, centerlines_valid)
+
+        exists = history_valid.any(-1)  # (B, N)
+        apart = ~torch.eye(exists.shape[1], dtype=torch.bool, device=exists.device)
+        pair_valid = (exists.unsqueeze(1) & apart).to(geometric.dtype).unsqueeze(-1)
+        offset = geometric.unsqueeze(1) - geometric.unsqueeze(2)
+        weights = self.interaction(length(offset), pattern)
+        for layer in self.layers:
+            geometric, pattern = layer(geometric, pattern, weights, pair_valid)
+
+        trajectories, probabilities = self.decoder(geometric[:, 0], pattern[:, 0], motion.velocity)
+        return origin[:, None, None, :] + UNIT_M * trajectories, probabilities
+
+    def fuse_map(
+        self,
+        motion: MotionFeatures,
+        origin: Tensor,
+        heading: Tensor,
+        centerlines: Tensor,
+        centerlines_valid: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Read the map from the target's own frame; hand it to the target's features."""
+        points = (centerlines - origin[:, None, None, :]) / UNIT_M
+        points = masked(points, centerlines_valid)  # (B, Q, L, 2)
+        direction, has_direction = point_directions(points, centerlines_valid)
+        points, direction = points.flatten(1, 2), direction.flatten(1, 2)  # (B, P, 2)
+        valid = (centerlines_valid & has_direction).flatten(1)  # (B, P)
+        distance2 = points.square().sum(-1) * UNIT_M**2
+        moved = motion.velocity[:, :, 1] * UNIT_M  # (B, 2) metres in a second, over the last second
+        canonical = canonical_from_tile(heading_vector(moved, heading, direction, distance2, valid))
+        tokens = torch.cat([points @ canonical, direction @ canonical], -1)  # (B, P, 4) invariant
+        feature, lanes = self.map(tokens, valid, masked(points, valid), motion.pattern[:, 0])
+
+        target = torch.cat([motion.geometric[:, 0], lanes], -1)  # (B, 2, C + pointers) turns
+        geometric = torch.cat([self.fuse(target).unsqueeze(1), motion.geometric[:, 1:]], 1)
+        pattern = torch.cat(
+            [(motion.pattern[:, 0] + feature).unsqueeze(1), motion.pattern[:, 1:]], 1
+        )
+        return geometric, pattern
+
+
+@dataclass(frozen=True, slots=True)
+class MotionFeatures:
+    """What the agents' histories say."""
+
+    geometric: Tensor
+    """(B, N, 2, C) network units, relative to the target."""
+    pattern: Tensor
+    """(B, N, D)"""
+    velocity: Tensor
+    """(B, 2, S) the target's velocity fitted over SLOPE_STEPS, network units per second."""
+
+
+class MotionInit(nn.Module):
+    """EqMotion's initialisation layer, with masks.
+
+    Geometric: bias-free mixing of the steps of each history. Pattern: speeds, changes of speed and
+    direction between steps, which steps were seen.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        steps = config.history_steps
+        self.dt_s = config.dt_s
+        self.mix = nn.Linear(2 * steps - 1 + len(SLOPE_STEPS), config.channels, bias=False)
+        self.gate = nn.Linear(config.width, config.channels)
+        invariants = steps + (steps - 1) + 2 * (steps - 2) + 3 * len(SLOPE_STEPS)
+        self.pattern = mlp([invariants, config.width, config.width])
+
+    def forward(self, history: Tensor, valid: Tensor, last: Tensor) -> MotionFeatures:
+        """Masked history (B, N, T, 2), valid (B, N, T), last seen positions (B, N, 2)."""
+        relative = masked((history - last.unsqueeze(2)) / UNIT_M, valid).transpose(2, 3)
+        both = valid[..., 1:] & valid[..., :-1]  # (B, N, T - 1)
+        step = (relative[..., 1:] - relative[..., :-1]) * both.unsqueeze(2) / self.dt_s
+        slopes = self._slopes(relative, valid)  # (B, N, 2, S)
+        pattern = self.pattern(self._invariants(step, slopes, valid))
+        mixed = self.mix(torch.cat([relative, step, slopes], -1))  # (B, N, 2, C)
+        mixed = mixed * (1.0 + self.gate(pattern).unsqueeze(-2))
+        place = ((last - last[:, :1]) / UNIT_M) * valid.any(-1).unsqueeze(-1)  # (B, N, 2)
+        return MotionFeatures(mixed + place.unsqueeze(-1), pattern, slopes[:, 0])
+
+    def _slopes(self, relative: Tensor, valid: Tensor) -> Tensor:
+        """Least-squares velocities (B, N, 2, S) over the seen steps of each window; 0 for one."""
+        steps = relative.shape[-1]
+        time = torch.arange(1 - steps, 1, dtype=relative.dtype, device=relative.device) * self.dt_s
+        window = torch.stack([(time > -(n - 0.5) * self.dt_s).to(time) for n in SLOPE_STEPS])
+        weight = valid.unsqueeze(-2).to(relative.dtype) * window  # (B, N, S, T)
+        count = weight.sum(-1, keepdim=True).clamp(min=1.0)
+        centred = (time - (weight * time).sum(-1, keepdim=True) / count) * weight
+        spread = (centred * time).sum(-1, keepdim=True)  # 0 with one seen step
+        weight = centred / spread.clamp(min=0.25 * self.dt_s**2)
+        return relative @ weight.transpose(-1, -2)
+
+    def _invariants(self, step: Tensor, slopes: Tensor, valid: Tensor) -> Tensor:
+        """(B, N, I): speeds, accelerations along and across, curvature; what was seen."""
+        before, after = step[..., :-1], step[..., 1:]
+        speed = length(before) + 0.1  # m/s / UNIT_M: standing does not divide by 0
+        other = slopes.roll(1, -1)
+        return torch.cat(
+            [
+                valid.to(step.dtype),
+                length(step),
+                dot(after - before, before) / speed,
+                cross(before, after) / speed,
+                length(slopes),
+                dot(slopes, other),
+                cross(slopes, other),
+            ],
+            -1,
+        )
+
+
+class Decoder(nn.Module):
+    """Vectors of the target -> K trajectories around its constant-velocity course.
+
+    The course is a bias-free mixture of the target's own fitted velocities, chosen by its pattern
+    features, so it turns with the world like everything else here.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.modes, self.steps = config.num_modes, config.horizon_steps
+        hidden, width = config.channels, config.width
+        self.vectors = GatedVectorMlp(
+            [hidden, hidden, hidden, hidden, self.modes * self.steps], width
+        )
+        self.course = nn.Linear(width, len(SLOPE_STEPS))
+        self.logits = mlp([width, width, self.modes])
+        time = torch.arange(1, self.steps + 1) * config.dt_s
+        self.register_buffer("time", time, persistent=False)
+
+    def forward(
+        self, geometric: Tensor, pattern: Tensor, velocity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Geometric (B, 2, C), pattern (B, D), velocity (B, 2, S).
+
+        Returns trajectories (B, K, H, 2) relative to the target, network units, and probabilities
+        (B, K); the most probable mode first.
+        """
+        share = self.course(pattern).softmax(-1).unsqueeze(-2)  # (B, 1, S)
+        course = (velocity * share).sum(-1, keepdim=True) * self.time  # (B, 2, H)
+        offset = self.vectors(geometric, pattern).unflatten(-1, (self.modes, self.steps))
+        scaled = offset * self.time / UNIT_M  # later steps move farther: every output is about 1
+        trajectories = (course.unsqueeze(2) + scaled).permute(0, 2, 3, 1)
+        probabilities = self.logits(pattern).softmax(-1)
+        if self.modes == 1:
+            return trajectories, probabilities
+        probabilities, order = probabilities.sort(dim=-1, descending=True, stable=True)
+        order = order[..., None, None].expand(-1, -1, self.steps, 2)
+        return trajectories.gather(1, order), probabilities
