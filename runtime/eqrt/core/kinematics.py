@@ -13,6 +13,12 @@ Bool = NDArray[np.bool_]
 
 BASELINE_STEPS = 5
 """Velocity of the baseline is the mean of the last half second."""
+FIT_STEPS = 10
+"""The fallback's velocity is fitted over the last second."""
+TURNING_MPS = 2.0
+"""Slower than this, a direction is mostly noise."""
+MAX_TURN_RAD_S = 0.8
+"""A tight turn at a junction; more is noise."""
 
 
 def constant_velocity(history: Float64, valid: Bool, horizon_steps: int) -> Float64:
@@ -48,6 +54,33 @@ def constant_turn(
     return np.asarray(
         position[:, None] + along[..., None] * velocity[:, None] + across[..., None] * left[:, None]
     )
+
+
+def fit_motion(history: Float64, valid: Bool, dt_s: float) -> tuple[Float64, Float64]:
+    """Velocity (B, 2) in m/s and turn rate (B,) in rad/s now, from histories (B, T, 2).
+
+    The velocity is the least-squares slope over the last second. The turn rate compares it with the
+    slope over the second before, and is 0 for a target too slow or too shortly seen to tell.
+    """
+    steps = valid.shape[1]
+    half = min(FIT_STEPS, steps)
+    now = _slope(history[:, -half:], valid[:, -half:], dt_s)
+    before = _slope(history[:, :-half], valid[:, :-half], dt_s)
+    apart_s = 0.5 * steps * dt_s  # between the middles of the two windows
+    cross = before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]
+    turned = np.arctan2(cross, (before * now).sum(-1))
+    slow = np.minimum(np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1)) < TURNING_MPS
+    return now, np.where(slow, 0.0, np.clip(turned / apart_s, -MAX_TURN_RAD_S, MAX_TURN_RAD_S))
+
+
+def _slope(history: Float64, valid: Bool, dt_s: float) -> Float64:
+    """Least-squares velocity (B, 2) over the valid steps of (B, T, 2); 0 with fewer than two."""
+    time = np.arange(valid.shape[1]) * dt_s
+    count = np.maximum(valid.sum(axis=1, keepdims=True), 1)
+    centred = np.where(valid, time - (valid * time).sum(axis=1, keepdims=True) / count, 0.0)
+    spread = np.maximum((centred**2).sum(axis=1), 0.25 * dt_s**2)
+    seen = np.where(valid[..., None], history, 0.0)
+    return np.asarray((centred[..., None] * seen).sum(axis=1) / spread[:, None])
 
 
 def _velocity_start(valid: Bool, last: NDArray[np.intp]) -> NDArray[np.intp]:

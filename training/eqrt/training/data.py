@@ -100,8 +100,8 @@ class TrackGrid:
 
     positions: NDArray[np.float64]
     """(A, S, 2) map frame."""
-    heading: NDArray[np.float64]
-    """(A, S) radians."""
+    heading_rad: NDArray[np.float64]
+    """(A, S)"""
     valid: NDArray[np.bool_]
     """(A, S)"""
 
@@ -117,7 +117,7 @@ class TrackGrid:
         )
         for row, track in enumerate(scenario.tracks):
             grid.positions[row, track.step] = track.position
-            grid.heading[row, track.step] = track.heading
+            grid.heading_rad[row, track.step] = track.heading_rad
             grid.valid[row, track.step] = True
         return grid
 
@@ -130,7 +130,7 @@ class TrackGrid:
         """What was known at `step`: the last `history_steps` steps up to it."""
         steps = np.arange(step - history_steps + 1, step + 1)
         inside = steps >= 0
-        heading = self.heading[:, step]
+        heading = self.heading_rad[:, step]
         known = self.valid[:, step, None]
         return AgentHistories(
             positions=self.positions[:, np.maximum(steps, 0)],

@@ -12,6 +12,7 @@ geometric features: that is what keeps them exactly equivariant.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -62,6 +63,25 @@ class VectorNonlinearity(nn.Module):
         return kept
 
 
+RELATIONS = 5
+"""Numbers that `relations` gives for every pair of agents."""
+
+
+def relations(place: Tensor, velocity: Tensor) -> Tensor:
+    """How agent j lies and moves as seen from agent i: (B, N, N, RELATIONS). Does not turn.
+
+    place, velocity: (B, N, 2). Distance; then, along and to the left of i's own motion, where j is
+    and how it moves against i. EqMotion's pairs know distances only, which cannot tell ahead from
+    behind or left from right; traffic can. An agent that stands has no axis, and sees distances.
+    """
+    speed = (velocity.square().sum(-1, keepdim=True) + 0.01).sqrt()  # fades below 1 m/s
+    ahead = (velocity / speed).unsqueeze(2).unsqueeze(-1)  # (B, N, 1, 2, 1)
+    pair = torch.stack([place, velocity], -1)  # (B, N, 2, 2)
+    offset = pair.unsqueeze(1) - pair.unsqueeze(2)  # (B, N, N, 2, 2) from i to j
+    along, left = dot(offset, ahead), cross(ahead, offset)  # (B, N, N, 2)
+    return torch.cat([length(offset[..., :1]), along, left], -1)
+
+
 class InteractionReasoning(nn.Module):
     """Soft categories of every pair of agents, inferred once (EqMotion's reasoning module).
 
@@ -73,15 +93,30 @@ class InteractionReasoning(nn.Module):
         super().__init__()
         self.receiver = nn.Linear(width, width)
         self.sender = nn.Linear(width, width, bias=False)
-        self.distance = nn.Linear(channels, width, bias=False)
+        self.distance = nn.Linear(channels + RELATIONS, width, bias=False)
         self.readout = nn.Sequential(nn.SiLU(), nn.Linear(width, width), nn.SiLU())
         self.category = nn.Linear(width, categories)
 
     def forward(self, distance: Tensor, pattern: Tensor) -> Tensor:
-        """Distances (B, N, N, C) and patterns (B, N, D) -> weights (B, N, N, R), sum 1 over R."""
+        """Pairs (B, N, N, C + RELATIONS), patterns (B, N, D) -> weights (B, N, N, R), sum 1 over R.
+
+        `distance`: the channel distances, and `relations`.
+        """
         pair = self.receiver(pattern).unsqueeze(2) + self.sender(pattern).unsqueeze(1)
         weights: Tensor = self.category(self.readout(pair + self.distance(distance))).softmax(-1)
         return weights
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """What is known of every pair of agents before the layers run."""
+
+    weights: Tensor
+    """(B, N, N, R) interaction categories."""
+    relations: Tensor
+    """(B, N, N, RELATIONS)"""
+    valid: Tensor
+    """(B, N, N, 1) 1.0 where agent j exists and is not i."""
 
 
 class FeatureLearning(nn.Module):
@@ -98,21 +133,18 @@ class FeatureLearning(nn.Module):
         self.inner = nn.Linear(width, channels)
         self.receiver = nn.Linear(width, width * categories)
         self.sender = nn.Linear(width, width * categories, bias=False)
-        self.distance = nn.Linear(channels, width * categories, bias=False)
+        self.distance = nn.Linear(channels + RELATIONS, width * categories, bias=False)
         self.pull = nn.Linear(width, channels)
         self.nonlinearity = VectorNonlinearity(channels)
         self.update = mlp([2 * width + 2 * channels, width, width])
         self.norm = nn.LayerNorm(width)
 
-    def forward(
-        self, geometric: Tensor, pattern: Tensor, weights: Tensor, pair_valid: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Geometric (B, N, 2, C), pattern (B, N, D), category weights (B, N, N, R) -> the same two.
-
-        pair_valid (B, N, N, 1) is 1.0 where agent j exists and is not i.
-        """
+    def forward(self, geometric: Tensor, pattern: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
+        """Geometric (B, N, 2, C) and pattern (B, N, D) -> the same two, further on."""
+        weights, pair_valid = pairs.weights, pairs.valid
         offset = geometric.unsqueeze(1) - geometric.unsqueeze(2)  # (B, N, N, 2, C) from i to j
-        message = self._messages(length(offset), pattern, weights) * pair_valid  # (B, N, N, D)
+        distance = torch.cat([length(offset), pairs.relations], -1)
+        message = self._messages(distance, pattern, weights) * pair_valid  # (B, N, N, D)
         count = pair_valid.sum(2).clamp(min=1.0)  # (B, N, 1)
         pull = (self.pull(message) * pair_valid).unsqueeze(-2)  # (B, N, N, 1, C) does not turn
         aggregated = (pull * offset).sum(2) / count.unsqueeze(-2)  # (B, N, 2, C)

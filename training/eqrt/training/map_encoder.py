@@ -61,8 +61,9 @@ class PointTransformer(nn.Module):
         batch, count, width = tokens.shape
         qkv = self.qkv(tokens).view(batch, count, 3, self.heads, width // self.heads)
         query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)  # (B, heads, P, W / heads)
-        score = query @ key.transpose(-1, -2) / (width // self.heads) ** 0.5
-        weight = score.masked_fill(~valid[:, None, None, :], _MASKED).softmax(-1)
+        query = query / (width // self.heads) ** 0.5
+        hidden = (~valid[:, None, None, :]).to(tokens.dtype) * _MASKED
+        weight = (query @ key.transpose(-1, -2) + hidden).softmax(-1)
         attended = (weight @ value).transpose(1, 2).reshape(batch, count, width)
         tokens = self.norm1(tokens + self.project(attended))
         encoded: Tensor = self.norm2(tokens + self.feed_forward(tokens))

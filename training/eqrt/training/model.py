@@ -26,10 +26,12 @@ from eqrt.training.layers import (
     FeatureLearning,
     GatedVectorMlp,
     InteractionReasoning,
+    Pairs,
     cross,
     dot,
     length,
     mlp,
+    relations,
 )
 from eqrt.training.map_encoder import PointTransformer, point_directions
 
@@ -37,6 +39,10 @@ UNIT_M = 10.0
 """Network units: features of traffic (speeds per second, gaps) are about 1."""
 SLOPE_STEPS = (5, 10, 20)
 """Velocity is fitted over the last half, one and two seconds."""
+
+
+BASIS = 6
+"""Smooth functions of time that a trajectory is made of."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,11 +120,15 @@ class EquivariantPredictor(nn.Module):
         apart = ~torch.eye(exists.shape[1], dtype=torch.bool, device=exists.device)
         pair_valid = (exists.unsqueeze(1) & apart).to(geometric.dtype).unsqueeze(-1)
         offset = geometric.unsqueeze(1) - geometric.unsqueeze(2)
-        weights = self.interaction(length(offset), pattern)
+        relation = relations((last - last[:, :1]) / UNIT_M, motion.velocity[..., 1])
+        weights = self.interaction(torch.cat([length(offset), relation], -1), pattern)
+        pairs = Pairs(weights, relation, pair_valid)
         for layer in self.layers:
-            geometric, pattern = layer(geometric, pattern, weights, pair_valid)
+            geometric, pattern = layer(geometric, pattern, pairs)
 
-        trajectories, probabilities = self.decoder(geometric[:, 0], pattern[:, 0], motion.velocity)
+        trajectories, probabilities = self.decoder(
+            geometric[:, 0], pattern[:, 0], motion.velocity[:, 0]
+        )
         return origin[:, None, None, :] + UNIT_M * trajectories, probabilities
 
     def fuse_map(
@@ -136,7 +146,9 @@ class EquivariantPredictor(nn.Module):
         points, direction = points.flatten(1, 2), direction.flatten(1, 2)  # (B, P, 2)
         valid = (centerlines_valid & has_direction).flatten(1)  # (B, P)
         distance2 = points.square().sum(-1) * UNIT_M**2
-        moved = motion.velocity[:, :, 1] * UNIT_M  # (B, 2) metres in a second, over the last second
+        moved = (
+            motion.velocity[:, 0, :, 1] * UNIT_M
+        )  # (B, 2) metres in a second, over the last second
         canonical = canonical_from_tile(heading_vector(moved, heading, direction, distance2, valid))
         tokens = torch.cat([points @ canonical, direction @ canonical], -1)  # (B, P, 4) invariant
         feature, lanes = self.map(tokens, valid, masked(points, valid), motion.pattern[:, 0])
@@ -158,7 +170,7 @@ class MotionFeatures:
     pattern: Tensor
     """(B, N, D)"""
     velocity: Tensor
-    """(B, 2, S) the target's velocity fitted over SLOPE_STEPS, network units per second."""
+    """(B, N, 2, S) velocities fitted over SLOPE_STEPS, network units per second."""
 
 
 class MotionInit(nn.Module):
@@ -187,7 +199,7 @@ class MotionInit(nn.Module):
         mixed = self.mix(torch.cat([relative, step, slopes], -1))  # (B, N, 2, C)
         mixed = mixed * (1.0 + self.gate(pattern).unsqueeze(-2))
         place = ((last - last[:, :1]) / UNIT_M) * valid.any(-1).unsqueeze(-1)  # (B, N, 2)
-        return MotionFeatures(mixed + place.unsqueeze(-1), pattern, slopes[:, 0])
+        return MotionFeatures(mixed + place.unsqueeze(-1), pattern, slopes)
 
     def _slopes(self, relative: Tensor, valid: Tensor) -> Tensor:
         """Least-squares velocities (B, N, 2, S) over the seen steps of each window; 0 for one."""
@@ -223,6 +235,9 @@ class MotionInit(nn.Module):
 class Decoder(nn.Module):
     """Vectors of the target -> K trajectories around its constant-velocity course.
 
+    A trajectory is a sum of BASIS smooth functions of time, each 0 now: what the network cannot
+    draw, it need not learn to avoid.
+
     The course is a bias-free mixture of the target's own fitted velocities, chosen by its pattern
     features, so it turns with the world like everything else here.
     """
@@ -231,13 +246,12 @@ class Decoder(nn.Module):
         super().__init__()
         self.modes, self.steps = config.num_modes, config.horizon_steps
         hidden, width = config.channels, config.width
-        self.vectors = GatedVectorMlp(
-            [hidden, hidden, hidden, hidden, self.modes * self.steps], width
-        )
+        self.vectors = GatedVectorMlp([hidden, hidden, hidden, hidden, self.modes * BASIS], width)
         self.course = nn.Linear(width, len(SLOPE_STEPS))
         self.logits = mlp([width, width, self.modes])
         time = torch.arange(1, self.steps + 1) * config.dt_s
         self.register_buffer("time", time, persistent=False)
+        self.register_buffer("basis", _basis(self.steps), persistent=False)
 
     def forward(
         self, geometric: Tensor, pattern: Tensor, velocity: Tensor
@@ -249,12 +263,20 @@ class Decoder(nn.Module):
         """
         share = self.course(pattern).softmax(-1).unsqueeze(-2)  # (B, 1, S)
         course = (velocity * share).sum(-1, keepdim=True) * self.time  # (B, 2, H)
-        offset = self.vectors(geometric, pattern).unflatten(-1, (self.modes, self.steps))
-        scaled = offset * self.time / UNIT_M  # later steps move farther: every output is about 1
-        trajectories = (course.unsqueeze(2) + scaled).permute(0, 2, 3, 1)
+        coefficients = self.vectors(geometric, pattern).unflatten(-1, (self.modes, BASIS))
+        offset = coefficients @ self.basis  # (B, 2, K, H)
+        trajectories = (course.unsqueeze(2) + offset).permute(0, 2, 3, 1)
         probabilities = self.logits(pattern).softmax(-1)
         if self.modes == 1:
             return trajectories, probabilities
         probabilities, order = probabilities.sort(dim=-1, descending=True, stable=True)
         order = order[..., None, None].expand(-1, -1, self.steps, 2)
         return trajectories.gather(1, order), probabilities
+
+
+def _basis(steps: int) -> Tensor:
+    """(BASIS, H): s T_k(2 s - 1) with the Chebyshev polynomials T_k, s from 1 / H to 1."""
+    share = torch.arange(1, steps + 1, dtype=torch.float64) / steps
+    angle = torch.arccos((2 * share - 1).clamp(-1.0, 1.0))
+    rows = [share * torch.cos(k * angle) for k in range(BASIS)]
+    return torch.stack(rows).to(torch.get_default_dtype())

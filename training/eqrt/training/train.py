@@ -164,7 +164,10 @@ def train(
             if (step + 1) % loop.evaluate_every == 0 or step + 1 == steps:
                 metrics = evaluate(average, held_out)
                 seconds = time.perf_counter() - started
-                print(f"step {step + 1:>6} loss {running:.3f} {_row(metrics)} {seconds:.0f} s")
+                print(
+                    f"step {step + 1:>6} loss {running:.3f} {_row(metrics)} {seconds:.0f} s",
+                    flush=True,
+                )
                 log.write(json.dumps({"step": step + 1, "loss": running, **metrics}) + "\n")
                 log.flush()
     return average.eval()

@@ -1,0 +1,66 @@
+# `make demo` and `make test` set up what they need by themselves, once; `make help` lists the rest.
+
+# Any Python from 3.11 on: make demo PYTHON=/path/to/python3.13
+PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
+	$$python -c '$(IS_NEW_ENOUGH)' 2>/dev/null && echo $$python && break; done)
+# The workstation's environment (torch, linters), and the car's (neither torch nor onnx).
+VENV ?= .venv
+RUNTIME_VENV ?= .venv-runtime
+PYTEST_ARGS ?= -n 2 --dist loadfile
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-runtime lint bench clean
+
+help: ## list what can be made
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 16
+
+demo: $(RUNTIME_VENV)/.installed ## see it work: recorded traffic over CAN, predicted and scored
+	@$(RUNTIME_VENV)/bin/eqrt demo
+
+test: $(VENV)/.installed test-runtime ## run all tests: without torch what ships to the car, then the rest
+	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
+
+test-runtime: $(RUNTIME_VENV)/.installed-tests ## run the tests of what ships to the car, without torch
+	$(RUNTIME_VENV)/bin/python -m pytest $(PYTEST_ARGS) tests/core tests/runtime
+
+lint: $(VENV)/.installed ## check format, style, types, and who imports whom
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+
+bench: $(VENV)/.installed ## measure against the budgets; wants a quiet machine
+	$(VENV)/bin/python -m pytest --benchmark-enable --benchmark-only tests/bench
+
+clean: ## remove the environments and everything else that was made here
+	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp `.installed` in an environment is as old as the environment's last update.
+IS_NEW_ENOUGH = import sys; sys.exit(sys.version_info < (3, 11))
+PIP_INSTALL = -m pip install -qq --disable-pip-version-check --constraint constraints.txt
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(call create_environment,$(VENV),the workstation: torch and linters)
+	@$(VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
+	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps]' --group dev
+	@touch $@
+
+$(RUNTIME_VENV)/.installed: pyproject.toml constraints.txt
+	$(call create_environment,$(RUNTIME_VENV),what ships to the car)
+	@$(RUNTIME_VENV)/bin/python $(PIP_INSTALL) --editable .
+	@touch $@
+
+$(RUNTIME_VENV)/.installed-tests: $(RUNTIME_VENV)/.installed
+	@$(RUNTIME_VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
+	@$(RUNTIME_VENV)/bin/python $(PIP_INSTALL) --group test
+	@touch $@
+
+# $(1) folder, $(2) what for. Says in one line what Python and pip would say in twenty.
+define create_environment
+	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or newer found (tried python3 and python3.11 to python3.13); install one, or name it: make PYTHON=/path/to/python3" >&2; exit 1; }
+	@$(PYTHON) -c '$(IS_NEW_ENOUGH)' 2>/dev/null || { echo "make: $(PYTHON) is not Python 3.11 or newer ($$($(PYTHON) --version 2>&1 | tail -n 1)); name one that is: make PYTHON=/path/to/python3" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "make: $(PYTHON) cannot make virtual environments; on Debian and Ubuntu: apt-get install python3-venv" >&2; exit 1; }
+	@echo "setting up $(1) ($(2)) with $$($(PYTHON) --version), once"
+	@test -x $(1)/bin/python || $(PYTHON) -m venv $(1)
+endef

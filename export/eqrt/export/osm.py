@@ -1,0 +1,95 @@
+"""Lanelet2 files as XML: what must hold before the library may see them.
+
+The `lanelet2` package crashes the process on references to things that are not there. So only whole
+lanelets are handed to it, with the speed limits that stand beside them; of the rest (traffic
+lights, areas, right of way) a tile knows nothing.
+"""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from pathlib import Path
+from xml.etree import ElementTree
+
+from eqrt.core.errors import TileError
+
+Element = ElementTree.Element
+
+
+def read_osm(source: Path) -> Element:
+    """The `<osm>` element of a plain or gzipped file. Raises TileError naming the file."""
+    try:
+        data = source.read_bytes()
+        if data.startswith(b"\x1f\x8b"):
+            data = gzip.decompress(data)
+        root = ElementTree.fromstring(data)
+    except FileNotFoundError as error:
+        raise TileError(f"{source}: no such map file") from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise TileError(f"{source}: cannot be read ({error}); fetch or unpack it again") from error
+    except ElementTree.ParseError as error:
+        raise TileError(f"{source}: not XML ({error}); expected a Lanelet2 map") from error
+    if root.tag != "osm" or root.find("node") is None:
+        raise TileError(f"{source}: the root is <{root.tag}>, expected <osm> with nodes")
+    return root
+
+
+def keep_lanelets(root: Element) -> list[str]:
+    """Remove all but whole lanelets and what they are made of; say which are not whole."""
+    nodes = {node.get("id") for node in root.findall("node")}
+    ways = {way.get("id") for way in root.findall("way") if _is_line(way, nodes)}
+    limits = {
+        relation.get("id") for relation in root.findall("relation") if _is_limit(relation, ways)
+    }
+    kept = {"way": ways, "relation": limits}
+    dropped = []
+    for child in list(root):
+        if child.tag == "relation" and _kind(child, "type") == "lanelet":
+            if fault := _fault(child, ways):
+                dropped.append(f"lanelet {child.get('id')} {fault}")
+                root.remove(child)
+            _unlink(child, limits)
+        elif child.get("id") not in kept.get(child.tag, nodes):
+            root.remove(child)
+    return dropped
+
+
+def _is_line(way: Element, nodes: set[str | None]) -> bool:
+    points = [point.get("ref") for point in way.findall("nd")]
+    return len(points) >= 2 and nodes.issuperset(points)
+
+
+def _is_limit(relation: Element, ways: set[str | None]) -> bool:
+    """Whether a relation is a speed limit, written as a regulatory element, whole."""
+    return (
+        _kind(relation, "type") == "regulatory_element"
+        and _kind(relation, "subtype") == "speed_limit"
+        and all(
+            member.get("type") == "way" and member.get("ref") in ways
+            for member in relation.findall("member")
+        )
+    )
+
+
+def _kind(element: Element, key: str) -> str | None:
+    tag = element.find(f"tag[@k='{key}']")
+    return None if tag is None else tag.get("v")
+
+
+def _fault(lanelet: Element, ways: set[str | None]) -> str | None:
+    """What keeps a lanelet from being whole."""
+    for side in ("left", "right"):
+        bounds = [bound.get("ref") for bound in lanelet.findall(f"member[@role='{side}']")]
+        if len(bounds) != 1:
+            return f"has {len(bounds)} {side} bounds, expected one"
+        if bounds[0] not in ways:
+            return f"has a {side} bound that is not there or not whole (way {bounds[0]})"
+    return None
+
+
+def _unlink(lanelet: Element, limits: set[str | None]) -> None:
+    """Remove the members that are neither bounds nor among `limits`."""
+    for member in lanelet.findall("member"):
+        if member.get("role") not in {"left", "right"} and member.get("ref") not in limits:
+            lanelet.remove(member)

@@ -1,0 +1,198 @@
+"""Maps of other formats, turned into tiles.
+
+Lanelet2 maps are projected to the plane that touches the Earth at the origin (east, north). Local
+ones keep their own plane: those whose nodes say `local_x` and `local_y`, and those drawn around
+latitude and longitude zero. CommonRoad scenarios are planar already. OpenDRIVE and Argoverse maps
+are not read.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.errors import TileError, UsageError
+from eqrt.core.lanes import Lane, LaneMap, LaneType, build_lane_map, middle_line
+from eqrt.core.tile import TileInfo, decode, encode
+from eqrt.export.osm import keep_lanelets, read_osm
+from eqrt.training.commonroad import lane_map as commonroad_lane_map
+from eqrt.training.commonroad import read_scenario
+
+Origin = tuple[float, float]
+"""Latitude and longitude in degrees, WGS 84."""
+
+
+def build_tile(source: Path, origin: Origin | None, credit: str | None) -> tuple[bytes, list[str]]:
+    """The tile file's bytes for a map file, and what of the map had to be left out.
+
+    Without `origin`, that of a Lanelet2 map is the middle of its nodes, and that of a planar map is
+    not known. Raises TileError or LogError naming the file if it cannot be used, UsageError if
+    `lanelet2` is not installed.
+    """
+    plain = source.name.removesuffix(".gz")
+    if plain.endswith(".osm"):
+        built = _from_lanelet2(source, origin)
+    elif plain.endswith(".xml"):
+        built = _from_commonroad(source, origin)
+    else:
+        raise TileError(
+            f"{source}: cannot tell the map's format by its name; supported are Lanelet2 (.osm) "
+            "and CommonRoad (.xml), also gzipped"
+        )
+    latitude_deg, longitude_deg = built.origin or (math.nan, math.nan)
+    info = TileInfo(
+        name=plain.rpartition(".")[0],
+        source=source.name,
+        credit=built.credit if credit is None else credit,
+        origin_latitude_deg=latitude_deg,
+        origin_longitude_deg=longitude_deg,
+    )
+    data = encode(built.lane_map, info)
+    decode(data, str(source))  # a file that has not been read back is not finished
+    return data, built.skipped
+
+
+@dataclass(frozen=True, slots=True)
+class _Built:
+    lane_map: LaneMap
+    origin: Origin | None
+    credit: str
+    skipped: list[str]
+
+
+def _from_commonroad(source: Path, origin: Origin | None) -> _Built:
+    scenario = read_scenario(source)
+    return _Built(commonroad_lane_map(scenario), origin, scenario.source, [])
+
+
+def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
+    lanelet2 = _import_lanelet2()
+    root = read_osm(source)
+    skipped = keep_lanelets(root)
+    planar = _move_to_plane(root, lanelet2) or _near_null_island(_middle(root, source))
+    projected_from = (0.0, 0.0) if planar else origin or _middle(root, source)
+    projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*projected_from))
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder, "map.osm")
+        ElementTree.ElementTree(root).write(plain)
+        try:
+            lanelets, errors = lanelet2.io.loadRobust(str(plain), projector)
+        except RuntimeError as error:
+            raise TileError(f"{source}: not a Lanelet2 map ({error})") from error
+    lanes = build_lane_map(_lanes(lanelets, lanelet2), str(source))
+    skipped += [str(error).strip("\t -") for error in errors][1:]  # the first is a heading
+    return _Built(lanes, origin if planar else projected_from, "", skipped)
+
+
+def _import_lanelet2() -> Any:
+    try:
+        import lanelet2  # noqa: PLC0415  # only this format needs it, and few install it
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            "reading Lanelet2 maps needs the package 'lanelet2', which is not installed; "
+            "install it with: pip install 'eqrt[maps]'"
+        ) from error
+    return lanelet2
+
+
+def _middle(root: ElementTree.Element, source: Path) -> Origin:
+    """The middle of all nodes, to the seventh decimal (a centimetre)."""
+    try:
+        places = np.array(
+            [(float(node.get("lat", "")), float(node.get("lon", ""))) for node in root.iter("node")]
+        )
+    except ValueError as error:
+        raise TileError(
+            f"{source}: a node has no latitude and longitude, and no local_x and local_y either"
+        ) from error
+    latitude_deg, longitude_deg = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    return round(float(latitude_deg), 7), round(float(longitude_deg), 7)
+
+
+def _near_null_island(middle: Origin) -> bool:
+    """Whether the map lies in the ocean at (0, 0): a local map, drawn where no roads are."""
+    return max(map(abs, middle)) < 0.5  # degrees, 55 km
+
+
+def _move_to_plane(root: ElementTree.Element, lanelet2: Any) -> bool:
+    """Whether all nodes have `local_x` and `local_y`; if so, they become the nodes' places.
+
+    The library projects latitude and longitude whatever the file says, so they are set to what it
+    will turn back into the local values.
+    """
+    nodes = root.findall("node")
+    places = [(node.find("tag[@k='local_x']"), node.find("tag[@k='local_y']")) for node in nodes]
+    if any(x is None or y is None for x, y in places):
+        return False
+    projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(0.0, 0.0))
+    for node, place in zip(nodes, places, strict=True):
+        x_m, y_m = (float(tag.get("v", "")) for tag in place if tag is not None)
+        point = projector.reverse(lanelet2.core.BasicPoint3d(x_m, y_m, 0.0))
+        node.attrib.update(lat=f"{point.lat:.12f}", lon=f"{point.lon:.12f}")
+        for tag in node.findall("tag[@k='ele']"):
+            node.remove(tag)
+        ElementTree.SubElement(node, "tag", k="ele", v=f"{point.alt:.6f}")
+    return True
+
+
+def _lanes(lanelets: Any, lanelet2: Any) -> Iterator[Lane]:
+    """Lanes that vehicles may drive; a lanelet open both ways gives two, the second as -id."""
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    graph = lanelet2.routing.RoutingGraph(lanelets, rules)
+    for lanelet in sorted(lanelets.laneletLayer, key=lambda lanelet: int(lanelet.id)):
+        for way in (lanelet, lanelet.invert()):
+            if rules.canPass(way):
+                yield _lane(way, graph, rules)
+
+
+def _lane(way: Any, graph: Any, rules: Any) -> Lane:
+    return Lane(
+        lane_id=_lane_id(way),
+        centerline=middle_line(_line(way.leftBound), _line(way.rightBound)),
+        successors=[_lane_id(after) for after in graph.following(way)],
+        left=_neighbour(graph.left(way), graph.adjacentLeft(way)),
+        right=_neighbour(graph.right(way), graph.adjacentRight(way)),
+        lane_type=_lane_type(dict(way.attributes)),
+        speed_limit_mps=_speed_limit_mps(way, rules),
+    )
+
+
+def _lane_id(way: Any) -> int:
+    return -int(way.id) if way.inverted() else int(way.id)
+
+
+def _line(bound: Any) -> NDArray[np.float64]:
+    return np.array([(point.x, point.y) for point in bound])
+
+
+def _neighbour(reachable: Any, beside: Any) -> int | None:
+    """The lane that one may change to, or else the one behind a solid line."""
+    neighbour = reachable or beside
+    return None if neighbour is None else _lane_id(neighbour)
+
+
+def _lane_type(attributes: dict[str, str]) -> LaneType:
+    subtypes = {"highway": LaneType.HIGHWAY, "exit": LaneType.RAMP, "bus_lane": LaneType.BUS}
+    urban = LaneType.URBAN if attributes.get("location") == "urban" else LaneType.UNKNOWN
+    return subtypes.get(attributes.get("subtype", ""), urban)
+
+
+def _speed_limit_mps(way: Any, rules: Any) -> float:
+    """As the map states it, or the law's for a German road; NaN otherwise.
+
+    The library knows the law of Germany only, and would apply it everywhere.
+    """
+    attributes = dict(way.attributes)
+    if "speed_limit" in attributes or way.speedLimits() or attributes.get("region") == "de":
+        return float(rules.speedLimit(way).speedLimit) / 3.6
+    return math.nan

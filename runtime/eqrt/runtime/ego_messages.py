@@ -1,0 +1,59 @@
+"""Messages about the ego vehicle to its motion and its pose, one group of messages at a time."""
+
+from __future__ import annotations
+
+import math
+
+from eqrt.core.frames import Pose2, wrap_angle
+from eqrt.runtime.dbc_tables import Payload
+from eqrt.runtime.detections import EgoMotion, EgoPose
+from eqrt.runtime.ego_profile import EgoProfile
+
+_NEVER = float("-inf")
+_NAN = float("nan")
+
+
+class EgoDecoder:
+    """Decodes the messages of one `[[ego]]` of the profile."""
+
+    def __init__(self, profile: EgoProfile) -> None:
+        self._profile = profile
+        self._values = [[_NAN] * len(part.columns) for part in profile.parts]
+        self._arrived_s = [_NEVER] * len(profile.parts)
+
+    def add(self, part: int, data: Payload, timestamp_s: float) -> list[EgoMotion | EgoPose]:
+        """Take a message; the last one of the group tells, together with what is still fresh."""
+        profile = self._profile
+        self._values[part] = [column.read(data) for column in profile.parts[part].columns]
+        self._arrived_s[part] = timestamp_s
+        if part < len(profile.parts) - 1:
+            return []
+        for other, arrived_s in enumerate(self._arrived_s):
+            if not 0.0 <= timestamp_s - arrived_s <= profile.hold_s:
+                self._values[other] = [_NAN] * len(self._values[other])
+        if profile.valid is not None and not profile.valid.holds(self._values):
+            return []
+        age_s = self._number("age") or 0.0
+        return self._told(timestamp_s - profile.latency_s - age_s)
+
+    def _told(self, timestamp_s: float) -> list[EgoMotion | EgoPose]:
+        events: list[EgoMotion | EgoPose] = []
+        speed, yaw_rate = self._number("speed"), self._number("yaw_rate")
+        if speed is not None and self._profile.reverse is not None:
+            speed = -speed if self._profile.reverse.holds(self._values) else speed
+        if speed is not None or yaw_rate is not None:
+            events.append(
+                EgoMotion(timestamp_s=timestamp_s, speed_mps=speed, yaw_rate_rad_s=yaw_rate)
+            )
+        x, y, yaw = self._number("x"), self._number("y"), self._number("yaw")
+        if x is not None and y is not None and yaw is not None:
+            pose = Pose2(x, y, wrap_angle(yaw))
+            events.append(EgoPose(timestamp_s=timestamp_s, map_from_ego=pose))
+        return events
+
+    def _number(self, key: str) -> float | None:
+        field = self._profile.numbers.get(key)
+        if field is None:
+            return None
+        value = field.number(self._values)
+        return value if math.isfinite(value) else None

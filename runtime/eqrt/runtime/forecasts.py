@@ -1,0 +1,86 @@
+"""What the service says: the predictions of one cycle, with how they came about.
+
+Publishers and recorders get this record and nothing else. Arrays share their first axis A (the
+targets of the cycle); K modes, most probable first; H steps of `dt_s`. Map frame, metres, seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.frames import Pose2
+
+
+class Mode(IntEnum):
+    """How a cycle, or one target of it, was predicted; the numbers are those of `eqrt.dbc`.
+
+    A cycle carries the first that holds of SILENT, FALLBACK (of every target), NO_POSE, LATE and
+    NO_MAP, else RUN. A target carries FALLBACK, PARTIAL or RUN, for its own prediction.
+    """
+
+    RUN = 0
+    """The model's prediction, from full histories, a pose and a map."""
+    NO_MAP = 1
+    """No tile here: the model was given no centerlines."""
+    NO_POSE = 2
+    """No ego motion is known (nothing is predicted), or no map pose (predicted without the map)."""
+    PARTIAL = 3
+    """The target has been seen for less than the model's history."""
+    LATE = 4
+    """The prediction took longer than one period."""
+    FALLBACK = 5
+    """The model was absent or its output impossible: constant turn rate and velocity instead."""
+    SILENT = 6
+    """No input for three periods: nothing is predicted, whatever was said before is void."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForecastSet:
+    """The predictions of one cycle. Times are on the pipeline's clock."""
+
+    cycle: int
+    """Counts the cycles from 0, also those without targets."""
+    timestamp_s: float
+    """The newest measurement used; `map_from_ego` holds at this time."""
+    made_s: float
+    """When the prediction was finished."""
+    compute_s: float
+    """How long it took; 0 when replaying, so that a log gives the same bytes twice."""
+    mode: Mode
+    model_id: str
+    """The first digits of the model file's sha256, hexadecimal; empty without a model."""
+    tile_id: str
+    """Likewise of the tile; empty without a map."""
+    map_from_ego: Pose2
+    dt_s: float
+    """Between steps: step h of a target is at `anchor_s + (h + 1) * dt_s`."""
+    track_id: NDArray[np.int64]
+    """(A,) never used twice while the service runs."""
+    object_id: NDArray[np.int64]
+    """(A,) as the sensor numbers it."""
+    anchor_s: NDArray[np.float64]
+    """(A,) time of the target's last measurement, from which it is predicted."""
+    agent_mode: NDArray[np.uint8]
+    """(A,) `Mode`."""
+    position: NDArray[np.float64]
+    """(A, 2) at `anchor_s`."""
+    velocity: NDArray[np.float64]
+    """(A, 2) m/s over ground at `anchor_s`, NaN = not known."""
+    trajectories: NDArray[np.float64]
+    """(A, K, H, 2)"""
+    probabilities: NDArray[np.float64]
+    """(A, K) sum to 1."""
+
+    @property
+    def num_targets(self) -> int:
+        """A."""
+        return len(self.track_id)
+
+    @property
+    def age_s(self) -> NDArray[np.float64]:
+        """(A,) how old each target's last measurement was when the prediction was finished."""
+        return self.made_s - self.anchor_s

@@ -1,0 +1,284 @@
+"""Tiles from maps: the real ones lie right, hand-made ones to the millimetre, broken ones fail."""
+
+from __future__ import annotations
+
+import gzip
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eqrt.cli import main
+from eqrt.core.errors import EqrtError, TileError
+from eqrt.core.lanes import NO_LANE, LaneMap, LaneType
+from eqrt.core.tile import TileInfo, decode
+from eqrt.export.tile_build import Origin, build_tile
+from eqrt.runtime.tiles import load_tile
+
+DATA = Path(__file__).parents[1] / "data"
+KARLSRUHE = DATA / "maps/lanelet2_example/mapping_example.osm.gz"
+TOWN10HD = DATA / "maps/town10hd/Town10HD.osm.gz"
+US101 = DATA / "ngsim/USA_US101-22_4_T-1.xml.gz"
+
+Write = Callable[[str], Path]
+PLACES = {1: (0, 4), 2: (20, 4), 3: (0, 0), 4: (20, 0), 5: (40, 4), 6: (40, 0)}
+"""Node -> x, y metres: two lanelets, 4 m wide and 20 m long, one after the other."""
+WAYS = {11: (1, 2), 12: (3, 4), 13: (2, 5), 14: (4, 6)}
+TAGS = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
+
+
+def build(source: Path, origin: Origin | None = None) -> tuple[LaneMap, TileInfo, list[str]]:
+    data, skipped = build_tile(source, origin, None)
+    return *decode(data, "built"), skipped
+
+
+def lanelet(lanelet_id: int, left: int, right: int, **tags: str) -> str:
+    return (
+        f'<relation id="{lanelet_id}"><member type="way" ref="{left}" role="left"/>'
+        f'<member type="way" ref="{right}" role="right"/>{tagged(TAGS | tags)}</relation>'
+    )
+
+
+def tagged(tags: dict[str, str]) -> str:
+    return "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+
+
+def local_node(node: int, x_m: float, y_m: float) -> str:
+    place = tagged({"local_x": str(x_m), "local_y": str(y_m)})
+    return f'<node id="{node}" lat="" lon="">{place}</node>'
+
+
+def osm(nodes: str, *relations: str) -> str:
+    ways = "".join(
+        f'<way id="{way}"><nd ref="{first}"/><nd ref="{last}"/></way>'
+        for way, (first, last) in WAYS.items()
+    )
+    return f'<osm version="0.6">{nodes}{ways}{"".join(relations)}</osm>'
+
+
+LOCAL = "".join(local_node(node, x, y) for node, (x, y) in PLACES.items())
+ROAD = (lanelet(21, 11, 12), lanelet(22, 13, 14))
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def write(text: str) -> Path:
+        path = tmp_path / "road.osm"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("source", "lanes", "two_way", "connections", "length_km"),
+    [(KARLSRUHE, 388, 60, 378, 5.17), (TOWN10HD, 204, 0, 232, 5.93)],
+    ids=["Karlsruhe", "Town10HD"],
+)
+def test_real_lanelet2_maps_are_whole(
+    source: Path, lanes: int, two_way: int, connections: int, length_km: float
+) -> None:
+    lane_map, _, skipped = build(source)
+    assert skipped == []
+    assert lane_map.num_lanes == lanes
+    assert (lane_map.lane_id < 0).sum() == two_way
+    assert len(lane_map.successor) == connections
+    lines = [lane_map.lane_points(lane) for lane in range(lanes)]
+    total_m = sum(np.hypot(*np.diff(line, axis=0).T).sum() for line in lines)
+    assert abs(total_m / 1e3 - length_km) < 0.01
+
+
+@pytest.mark.parametrize("source", [KARLSRUHE, TOWN10HD], ids=["Karlsruhe", "Town10HD"])
+def test_real_lanes_join_and_lie_beside_each_other(source: Path) -> None:
+    lane_map, _, _ = build(source)
+    for lane in range(lane_map.num_lanes):
+        line = lane_map.lane_points(lane)
+        for successor in lane_map.successors_of(lane):
+            np.testing.assert_allclose(lane_map.lane_points(successor)[0], line[-1], atol=1e-3)
+        for neighbour, side in ((lane_map.left[lane], 1.0), (lane_map.right[lane], -1.0)):
+            if neighbour != NO_LANE:
+                other = lane_map.lane_points(neighbour)
+                across = other[len(other) // 2] - line[len(line) // 2]
+                ahead = line[-1] - line[0]
+                assert side * (ahead[0] * across[1] - ahead[1] * across[0]) > 0.0
+                assert ahead @ (other[-1] - other[0]) > 0.0
+
+
+def test_a_lanelet_open_both_ways_gives_a_lane_each_way() -> None:
+    lane_map, _, _ = build(KARLSRUHE)
+    index = {int(lane_id): lane for lane, lane_id in enumerate(lane_map.lane_id)}
+    for lane_id in (i for i in index if i < 0):
+        there, back = (lane_map.lane_points(index[i]) for i in (-lane_id, lane_id))
+        np.testing.assert_allclose(there, back[::-1], atol=1e-4)
+
+
+def test_the_same_map_gives_the_same_bytes() -> None:
+    assert build_tile(KARLSRUHE, None, None) == build_tile(KARLSRUHE, None, None)
+
+
+def test_the_origin_is_where_x_and_y_are_zero() -> None:
+    """A thousandth of a degree of latitude is 111.2 m at 49 degrees, of longitude 73.1 m."""
+    here, info, _ = build(KARLSRUHE, (49.0, 8.42))
+    assert (info.origin_latitude_deg, info.origin_longitude_deg) == (49.0, 8.42)
+    north, _, _ = build(KARLSRUHE, (49.001, 8.42))
+    east, _, _ = build(KARLSRUHE, (49.0, 8.421))
+    lane = int(np.argmin(np.abs(here.points).sum(axis=1)))  # where the planes are parallel
+    np.testing.assert_allclose((here.points - north.points)[lane], [0.0, 111.2], atol=0.1)
+    np.testing.assert_allclose((here.points - east.points)[lane], [73.1, 0.0], atol=0.1)
+
+
+def test_without_an_origin_the_middle_of_the_map_is_zero() -> None:
+    _, info, _ = build(KARLSRUHE)
+    assert 49.0 < info.origin_latitude_deg < 49.01
+    assert 8.41 < info.origin_longitude_deg < 8.46
+
+
+def test_a_map_around_latitude_and_longitude_zero_keeps_its_plane() -> None:
+    """Town10HD spans 225 by 210 m around CARLA's own origin."""
+    lane_map, info, _ = build(TOWN10HD)
+    assert np.isnan(info.origin_latitude_deg)
+    np.testing.assert_allclose(lane_map.points.min(axis=0), [-114.6, -141.2], atol=0.1)
+    np.testing.assert_allclose(lane_map.points.max(axis=0), [110.0, 68.7], atol=0.1)
+    placed, info, _ = build(TOWN10HD, (48.0, 11.0))
+    assert info.origin_latitude_deg == 48.0
+    np.testing.assert_array_equal(placed.points, lane_map.points)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (-300.5, 20.25), (81655.0, 50137.0)])
+def test_local_x_and_y_are_kept(write: Write, offset: tuple[float, float]) -> None:
+    nodes = "".join(
+        local_node(node, x + offset[0], y + offset[1]) for node, (x, y) in PLACES.items()
+    )
+    lane_map, info, _ = build(write(osm(nodes, *ROAD)))
+    np.testing.assert_allclose(lane_map.lane_points(0)[0] - offset, [0.0, 2.0], atol=0.01)
+    np.testing.assert_allclose(lane_map.lane_points(1)[-1] - offset, [40.0, 2.0], atol=0.01)
+    assert lane_map.successors_of(0).tolist() == [1]
+    assert np.isnan(info.origin_latitude_deg)
+
+
+def test_speed_limits_are_the_maps_own(write: Write) -> None:
+    stated = lanelet(21, 11, 12, speed_limit="36 km/h", subtype="highway")
+    lane_map, _, _ = build(write(osm(LOCAL, stated, lanelet(22, 13, 14))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [10.0, np.nan])
+    assert lane_map.lane_type.tolist() == [LaneType.HIGHWAY, LaneType.URBAN]
+
+
+def test_broken_lanelets_are_left_out_and_named(write: Write) -> None:
+    dangling = lanelet(23, 11, 99)
+    shapeless = '<relation id="24"><tag k="type" v="lanelet"/></relation>'
+    sign = '<relation id="31"><member type="way" ref="77" role="refers"/></relation>'
+    lane_map, _, skipped = build(write(osm(LOCAL, *ROAD, dangling, shapeless, sign)))
+    assert lane_map.lane_id.tolist() == [21, 22]
+    assert skipped == [
+        "lanelet 23 has a right bound that is not there or not whole (way 99)",
+        "lanelet 24 has 0 left bounds, expected one",
+    ]
+
+
+def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
+    lane_map, info, _ = build(US101, (34.138, -118.364))
+    assert lane_map.num_lanes == 18
+    assert info.name == "USA_US101-22_4_T-1"
+    assert info.credit == "Next Generation Simulation (NGSIM) and OpenStreetMaps (OSM)"
+    assert info.origin_longitude_deg == -118.364
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not XML"),
+        ("<osm", "not XML"),
+        ("<commonRoad/>", "the root is <commonRoad>, expected <osm> with nodes"),
+        ("<osm version='0.6'/>", "expected <osm> with nodes"),
+        (osm('<node id="1" lat="" lon=""/>'), "a node has no latitude and longitude"),
+        (osm(LOCAL), "no lanes for vehicles"),
+        (osm(LOCAL, lanelet(21, 11, 12, subtype="walkway")), "no lanes for vehicles"),
+        (osm(local_node(1, 2e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
+        (osm(LOCAL.replace('v="20"', 'v="twenty"'), *ROAD), "local_x and local_y"),
+    ],
+)
+def test_a_broken_map_is_one_line_that_names_the_file(
+    write: Write, text: str, message: str
+) -> None:
+    path = write(text)
+    with pytest.raises(TileError) as caught:
+        build_tile(path, None, None)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_formats_that_are_not_read_are_said(tmp_path: Path) -> None:
+    for name in ("e6mini.xodr", "map.json", "noname"):
+        with pytest.raises(EqrtError, match=r"supported are Lanelet2 .* and CommonRoad"):
+            build_tile(tmp_path / name, None, None)
+    with pytest.raises(EqrtError, match="no such map file"):
+        build_tile(tmp_path / "none.osm", None, None)
+
+
+def test_the_command_builds_a_tile_that_loads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "karlsruhe.tile"
+    command = ["tile", "build", str(KARLSRUHE), "--out", str(out), "--origin", "49,8.42"]
+    assert main([*command, "--credit", "FZI, BSD-3"]) == 0
+    printed = capsys.readouterr().out
+    assert main(["tile", "info", str(out)]) == 0
+    assert capsys.readouterr().out == printed
+    assert "388, 5.17 km" in printed
+    assert "latitude 49.0000000, longitude 8.4200000" in printed
+    assert "FZI, BSD-3" in printed
+    assert load_tile(out).info.tile_id in printed
+
+
+def test_a_failed_build_leaves_the_old_tile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.tile"
+    assert main(["tile", "build", str(US101), "--out", str(out)]) == 0
+    before = out.read_bytes()
+    broken = tmp_path / "broken.xml.gz"
+    broken.write_bytes(US101.read_bytes()[:5000])
+    capsys.readouterr()
+    assert main(["tile", "build", str(broken), "--out", str(out)]) == 1
+    assert capsys.readouterr().err.startswith(f"eqrt: {broken}: cannot be read")
+    assert out.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tile", "broken.xml.gz"]
+
+
+def test_a_tile_that_cannot_be_written_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "no" / "such" / "folder.tile"
+    assert main(["tile", "build", str(US101), "--out", str(out)]) == 1
+    assert capsys.readouterr().err.startswith(f"eqrt: {out}: the tile cannot be written")
+
+
+@pytest.mark.parametrize("origin", ["49", "49,8,1", "north,8", "91,8", "49,181", "nan,8"])
+def test_an_origin_that_is_no_place_is_wrong_usage(
+    origin: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["tile", "build", str(US101), "--out", "x", "--origin", origin])
+    assert caught.value.code == 2
+    assert "LAT,LON in degrees" in capsys.readouterr().err
+
+
+def test_without_lanelet2_the_command_says_what_to_install(tmp_path: Path) -> None:
+    source = tmp_path / "map.osm"
+    source.write_bytes(gzip.decompress(KARLSRUHE.read_bytes()))
+    program = (
+        "import sys; sys.modules['lanelet2'] = None; from eqrt.cli import main; "
+        f"sys.exit(main(['tile', 'build', {str(source)!r}, '--out', 'x']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], check=False, capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "eqrt: reading Lanelet2 maps needs the package 'lanelet2', which is not installed; "
+        "install it with: pip install 'eqrt[maps]'"
+    ]

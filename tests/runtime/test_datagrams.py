@@ -1,0 +1,140 @@
+"""Forecasts as datagrams: what is sent arrives, and who does not listen delays nobody."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from eqrt.core.errors import UsageError
+from eqrt.runtime.datagrams import (
+    MAX_BYTES,
+    DatagramPublisher,
+    decode_datagram,
+    encode_datagrams,
+)
+from eqrt.runtime.forecasts import ForecastSet
+from forecast_sets import many, nobody, one_car
+
+BAD_ADDRESSES = ["127.0.0.1", "nowhere", "127.0.0.1:port", "[::1]:99999", ":47310", ""]
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5.0)
+        yield receiver
+
+
+def address_of(listener: socket.socket) -> str:
+    return f"127.0.0.1:{listener.getsockname()[1]}"
+
+
+def assert_same(received: ForecastSet, sent: ForecastSet) -> None:
+    """Arrays to 0.1 mm, everything else exactly."""
+    for name in (field.name for field in fields(ForecastSet)):
+        values, expected = getattr(received, name), getattr(sent, name)
+        if isinstance(expected, np.ndarray):
+            assert values.dtype == expected.dtype
+            assert values.shape == expected.shape
+            np.testing.assert_allclose(values, expected, rtol=0.0, atol=1e-4, err_msg=name)
+        else:
+            assert values == expected, name
+
+
+@pytest.mark.parametrize("forecasts", [one_car(), many(32), nobody()], ids=["one", "32", "none"])
+def test_what_is_sent_arrives(forecasts: ForecastSet, listener: socket.socket) -> None:
+    with DatagramPublisher([address_of(listener)]) as publisher:
+        publisher.publish(forecasts)
+    datagram = decode_datagram(listener.recv(65_536))
+    assert (datagram.part, datagram.parts) == (0, 1)
+    assert_same(datagram.forecasts, forecasts)
+    assert (publisher.sent, publisher.failed) == (1, 0)
+
+
+def test_far_from_the_origin_of_the_map_millimetres_are_kept(listener: socket.socket) -> None:
+    """5,000 km away, where float32 would be off by 0.25 m."""
+    near, away = many(8), np.array([3e6, 4e6])
+    ego = replace(near.map_from_ego, x_m=near.map_from_ego.x_m + 3e6)
+    ego = replace(ego, y_m=ego.y_m + 4e6)
+    far = replace(
+        near,
+        map_from_ego=ego,
+        position=near.position + away,
+        trajectories=near.trajectories + away,
+    )
+    with DatagramPublisher([address_of(listener)]) as publisher:
+        publisher.publish(far)
+    assert_same(decode_datagram(listener.recv(65_536)).forecasts, far)
+
+
+def test_a_cycle_too_large_for_a_datagram_comes_in_parts() -> None:
+    """100 objects of six modes and 3 s; every object is in one part, whole."""
+    forecasts = many(100)
+    payloads = list(encode_datagrams(forecasts))
+    assert all(len(payload) <= MAX_BYTES for payload in payloads)
+    parts = [decode_datagram(payload) for payload in payloads]
+    assert [(part.part, part.parts) for part in parts] == [(0, 3), (1, 3), (2, 3)]
+    assert {part.forecasts.cycle for part in parts} == {forecasts.cycle}
+    track_id = np.concatenate([part.forecasts.track_id for part in parts])
+    np.testing.assert_array_equal(track_id, forecasts.track_id)
+    trajectories = np.concatenate([part.forecasts.trajectories for part in parts])
+    np.testing.assert_allclose(trajectories, forecasts.trajectories, rtol=0.0, atol=1e-4)
+
+
+def test_a_closed_port_fails_nothing(listener: socket.socket) -> None:
+    """The viewer has gone, the one beside it still gets everything."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        closed = address_of(gone)
+    with DatagramPublisher([closed, address_of(listener)]) as publisher:
+        for _ in range(3):
+            publisher.publish(one_car())
+    assert [decode_datagram(listener.recv(65_536)).forecasts.cycle for _ in range(3)] == [300] * 3
+    assert (publisher.sent, publisher.failed) == (6, 0)
+
+
+def test_a_listener_that_never_reads_delays_nothing(listener: socket.socket) -> None:
+    """Ninety megabytes for it are dropped by the system."""
+    forecasts = many(32)
+    with DatagramPublisher([address_of(listener)]) as publisher:
+        for _ in range(2000):
+            publisher.publish(forecasts)
+    assert publisher.sent + publisher.failed == 2000
+
+
+@pytest.mark.parametrize("address", BAD_ADDRESSES)
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(UsageError, match="give HOST:PORT"):
+        DatagramPublisher([address])
+
+
+def test_no_address_sends_nothing() -> None:
+    with DatagramPublisher([]) as publisher:
+        publisher.publish(one_car())
+    assert publisher.sent == 0
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x00", b"hello", b"\xff" * 200, b"\x81\xa7version\x01"])
+def test_something_else_is_not_taken_for_a_datagram(payload: bytes) -> None:
+    with pytest.raises(ValueError, match="eqrt"):
+        decode_datagram(payload)
+
+
+def test_a_datagram_of_another_version_says_so() -> None:
+    (payload,) = encode_datagrams(one_car())
+    later = payload.replace(b"\xa7version\x01", b"\xa7version\x02")
+    with pytest.raises(ValueError, match="datagram format 2, this version of eqrt reads format 1"):
+        decode_datagram(later)
+
+
+def test_half_a_datagram_is_refused() -> None:
+    """Wherever it was cut."""
+    (payload,) = encode_datagrams(one_car())
+    for length in range(0, len(payload), 7):
+        with pytest.raises(ValueError, match=r"eqrt|reshape|buffer"):
+            decode_datagram(payload[:length])

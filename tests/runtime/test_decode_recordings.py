@@ -1,0 +1,188 @@
+"""Real bytes of real sensors, decoded to what others decoded from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from can_recordings import detections_of, feed_all, messages_of, rav4_array, srr520_objects
+from eqrt.runtime.can_io import Decoder
+from eqrt.runtime.detections import Detections, EgoMotion, ObjectClass, VelocityKind
+from eqrt.runtime.profile import load_profile
+from tiny_sensor import profile_of
+
+Float64 = NDArray[np.float64]
+
+RAV4_BUSES = {"radar": "can1", "car": "can0"}
+TO_CENTER_M = 2.7  # the dataset's forward distances are from the middle of the car
+COARSE_M = 0.04  # and without the two lowest bits, which its DBC did not know
+
+
+def test_ars408_has_5609_objects_in_2001_cycles() -> None:
+    decoder = Decoder(load_profile("ars408"))
+    cycles = detections_of(feed_all(decoder, messages_of("ars408")))
+    counters = decoder.counters
+    assert len(cycles) == counters.cycles == 2001
+    assert sum(len(cycle.object_id) for cycle in cycles) == counters.objects == 5609
+    assert all(cycle.complete for cycle in cycles)
+    assert counters.messages == 24_878 == counters.used + counters.other_id
+    assert (counters.incomplete_cycles, counters.invalid_objects, counters.bad_counter) == (0, 0, 0)
+
+
+def test_the_first_ars408_object_is_as_calculated_by_hand() -> None:
+    """60B#5F5F2BCC80200193: 0x5F2B >> 3 is 3045, times 0.2, less 500, is 109 m; and so on."""
+    cycles = detections_of(feed_all(Decoder(load_profile("ars408")), messages_of("ars408")[:8]))
+    (first,) = cycles
+    assert first.object_id.tolist() == [0x5F]
+    np.testing.assert_allclose(first.position, [[109.0, -10.2]], atol=1e-9)
+    np.testing.assert_allclose(first.velocity, [[0.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose([first.length_m, first.width_m], [[2.0], [2.4]], atol=1e-9)
+    assert first.object_class.tolist() == [ObjectClass.CAR]
+    assert first.existence.tolist() == [1.0]
+    assert first.is_new.tolist() == [False]
+    assert first.velocity_kind is VelocityKind.RELATIVE
+    assert (first.timestamp_s, first.received_s) == (1591372012.436348, 1591372012.438365)
+
+
+def test_an_ars408_cycle_is_closed_by_its_last_message() -> None:
+    """Within 9 ms of its header, although the next header comes 70 ms later."""
+    cycles = detections_of(feed_all(Decoder(load_profile("ars408")), messages_of("ars408")))
+    assert max(cycle.received_s - cycle.timestamp_s for cycle in cycles) < 0.009
+    assert min(np.diff([cycle.timestamp_s for cycle in cycles])) > 0.065
+
+
+def test_rav4_radar_points_are_those_of_the_dataset() -> None:
+    """All 10,100: place, relative speed along the line of sight, slot, new-track flag."""
+    decoder = Decoder(load_profile("toyota-rav4"), RAV4_BUSES)
+    cycles = detections_of(feed_all(decoder, messages_of("rav4")))
+    assert len(cycles) == 1200
+    assert decoder.counters.objects == 10_100 == len(rav4_array("radar_value"))
+    assert all(cycle.complete for cycle in cycles)
+    np.testing.assert_allclose(points_of(cycles), dataset_points(), atol=1e-9)
+
+
+def points_of(cycles: list[Detections]) -> Float64:
+    """(D, 5) x, y, relative speed, arbitration id, new; slot by slot, each in order of time."""
+    position = np.concatenate([cycle.position for cycle in cycles])
+    velocity = np.concatenate([cycle.velocity for cycle in cycles])
+    columns = [
+        np.floor(position[:, 0] / COARSE_M + 1e-9) * COARSE_M + TO_CENTER_M,
+        position[:, 1],
+        (velocity * position).sum(axis=1) / np.hypot(*position.T),
+        0x210 + np.concatenate([cycle.object_id for cycle in cycles]),
+        np.concatenate([cycle.is_new for cycle in cycles]),
+    ]
+    time_s = np.repeat([c.timestamp_s for c in cycles], [len(c.object_id) for c in cycles])
+    return np.column_stack(columns)[np.lexsort((time_s, columns[3]))]
+
+
+def dataset_points() -> Float64:
+    value, time_s = rav4_array("radar_value"), rav4_array("radar_t")
+    return value[np.lexsort((time_s, value[:, 5]))][:, [0, 1, 2, 5, 6]]
+
+
+def test_rav4_messages_are_whole() -> None:
+    """Not one of 24,174 checksums fails, and no cycle of the radar is missing."""
+    decoder = Decoder(load_profile("toyota-rav4"), RAV4_BUSES)
+    feed_all(decoder, messages_of("rav4"))
+    counters = decoder.counters
+    assert counters.used == 1200 * 16 + 2 * 4974 + 66
+    assert counters.messages == counters.used + counters.other_id == 98_800
+    assert (counters.bad_checksum, counters.bad_counter) == (0, 0)
+    assert (counters.stray, counters.short) == (0, 0)
+
+
+def test_rav4_speed_is_that_of_the_dataset() -> None:
+    events = feed_all(Decoder(load_profile("toyota-rav4"), RAV4_BUSES), messages_of("rav4"))
+    speeds = [e for e in events if isinstance(e, EgoMotion) and e.speed_mps is not None]
+    decoded = np.array([(e.timestamp_s, e.speed_mps) for e in speeds], np.float64)
+    np.testing.assert_allclose(decoded[:, 0], rav4_array("speed_t"), atol=1e-6)
+    np.testing.assert_allclose(decoded[:, 1], rav4_array("speed_value")[:, 0], atol=1e-12)
+
+
+def test_rav4_yaw_rate_is_positive_to_the_left() -> None:
+    """It follows the change of the GNSS course, counter-clockwise seen from above."""
+    events = feed_all(Decoder(load_profile("toyota-rav4"), RAV4_BUSES), messages_of("rav4"))
+    turns = [e for e in events if isinstance(e, EgoMotion) and e.yaw_rate_rad_s is not None]
+    times_s, up = rav4_array("frame_times"), rav4_array("frame_positions")[0]
+    velocity = rav4_array("frame_velocities")
+    before, after = velocity[:-20], velocity[20:]  # one second apart
+    turned = (np.cross(before, after) @ up) / np.linalg.norm(up) / (before * after).sum(axis=1)
+    rate = [
+        np.mean([e.yaw_rate_rad_s for e in turns if start <= e.timestamp_s < start + 1.0])
+        for start in times_s[:-20:20]
+    ]
+    assert np.corrcoef(turned[::20], rate)[0, 1] > 0.8
+
+
+def test_a_role_on_another_channel_is_not_heard() -> None:
+    decoder = Decoder(load_profile("toyota-rav4"), {"radar": "can0", "car": "can1"})
+    assert feed_all(decoder, messages_of("rav4")) == []
+    assert decoder.counters.wrong_bus == 1200 * 16 + 2 * 4974 + 66
+
+
+PAIRS = """
+description = "the same radar, both messages of every track"
+
+[[sensor]]
+name = "pairs"
+bus = "radar"
+dbc = "opendbc/toyota_adas.dbc"
+framing = "slots"
+slots = { first = 0, last = 15 }
+timeout_s = 0.03
+velocity = "radial"
+
+[sensor.messages]
+a = { message = "TRACK_A_{slot}", counter = "COUNTER" }
+b = { message = "TRACK_B_{slot}", counter = "COUNTER" }
+
+[sensor.fields]
+x = "a.LONG_DIST"
+y = { signal = "a.LAT_DIST", sign = -1 }
+range_rate = "a.REL_SPEED"
+existence = { signal = "b.SCORE", unit = "%" }
+new_track = "a.NEW_TRACK == 1"
+valid = "a.VALID == 1"
+"""
+
+
+def test_rav4_tracks_with_their_second_messages_are_the_same_points(tmp_path: Path) -> None:
+    decoder = Decoder(profile_of(tmp_path, PAIRS), {"radar": "can1"})
+    cycles = detections_of(feed_all(decoder, messages_of("rav4")))
+    assert len(cycles) == 1200
+    assert all(cycle.complete for cycle in cycles)
+    np.testing.assert_allclose(points_of(cycles), dataset_points(), atol=1e-9)
+    score = np.concatenate([cycle.existence for cycle in cycles])
+    assert (score.min(), score.max()) == (0.0, 1.0)
+    assert decoder.counters.bad_counter == 0
+
+
+def test_srr520_has_the_40_objects_of_its_publisher() -> None:
+    decoder = Decoder(load_profile("srr520"))
+    events = feed_all(decoder, messages_of("srr520"))
+    (cycle,) = detections_of(events)
+    truth = {key: [item[key] for item in srr520_objects()] for key in srr520_objects()[0]}
+    assert cycle.complete
+    assert cycle.object_id.tolist() == truth["object_id"]
+    np.testing.assert_allclose(cycle.position.T, [truth["dist_x"], truth["dist_y"]], atol=1e-4)
+    np.testing.assert_allclose(cycle.velocity.T, [truth["v_abs_x"], truth["v_abs_y"]], atol=1e-9)
+    np.testing.assert_allclose(100 * cycle.existence, truth["score"], atol=1e-4)
+    boxed = np.array(truth["box_valid"]) == 1
+    for values, name in (
+        (cycle.length_m, "box_length"),
+        (cycle.width_m, "box_width"),
+        (cycle.heading_rad, "orientation"),
+    ):
+        np.testing.assert_allclose(values, np.where(boxed, truth[name], np.nan), atol=1e-5)
+    assert cycle.is_new.tolist() == [life <= 1 for life in truth["life_cycles"]]
+
+
+def test_srr520_repeats_the_ego_motion_it_was_given() -> None:
+    events = feed_all(Decoder(load_profile("srr520")), messages_of("srr520"))
+    (motion,) = [event for event in events if isinstance(event, EgoMotion)]
+    assert motion.speed_mps == pytest.approx(6.78121, abs=1e-4)
+    assert motion.yaw_rate_rad_s == pytest.approx(-0.0063293, abs=1e-6)

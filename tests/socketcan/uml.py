@@ -1,0 +1,101 @@
+"""A User-Mode Linux kernel, booted on the host's own files for one program.
+
+The guest sees the host's root file system read-only, except for one folder, where the program's
+output and exit status are left. It needs no privileges and no terminal, and each boot is a machine
+of its own, so any number may run side by side. A boot and its end take about two seconds.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from socketcan.machine import SETUP, Completed, environment
+
+KERNEL = "linux.uml"
+MODULES = Path("/usr/lib/uml/modules")
+DRIVERS = ("net/can/can", "net/can/can-raw", "drivers/net/can/dev/can-dev", "drivers/net/can/vcan")
+MEMORY_MB = 768
+BOOT_TIMEOUT_S = 60.0  # a boot takes 1.7 s; a machine that is busy with other tests takes longer
+
+
+def missing() -> str | None:
+    """The first thing that a boot needs and this machine lacks."""
+    needed = (KERNEL, "insmod", "ip", "timeout")
+    return next((name for name in needed if shutil.which(name, path=_path()) is None), None)
+
+
+def run_in_uml(command: Sequence[str], work: Path, timeout_s: float) -> Completed:
+    """Boot, run `command` in the folder `work`, halt; RuntimeError if the guest did not come up."""
+    machine = work / "uml"
+    machine.mkdir()
+    init = machine / "init"
+    init.write_text(_init(command, work, machine, timeout_s), encoding="utf-8")
+    init.chmod(0o755)
+    console = _boot(init, timeout_s + BOOT_TIMEOUT_S)
+    status, stdout, stderr = (machine / name for name in ("status", "stdout", "stderr"))
+    if not status.exists():
+        raise RuntimeError(f"the User-Mode Linux guest did not run the program:\n{console}")
+    return Completed(int(status.read_text()), stdout.read_text(), stderr.read_text())
+
+
+def _init(command: Sequence[str], work: Path, machine: Path, timeout_s: float) -> str:
+    """The guest's first process: a shell script that powers the guest off, however it ends."""
+    exports = "\n".join(f"export {k}={shlex.quote(v)}" for k, v in environment(work).items())
+    drivers = "\n".join(f'insmod "{MODULES}/$(uname -r)/kernel/{name}.ko"' for name in DRIVERS)
+    return f"""#!/bin/sh -e
+trap 'sync; echo o > /proc/sysrq-trigger; sleep 60' EXIT
+{exports}
+mount -t proc proc /proc
+mount -t sysfs sysfs /sys
+mkdir -p /dev/shm
+mount -t tmpfs tmpfs /dev/shm
+mount -t hostfs -o {shlex.quote(str(work))} none {shlex.quote(str(work))}
+{drivers}
+{SETUP}
+cd {shlex.quote(str(work))}
+status=0
+timeout --kill-after=1 {timeout_s} {shlex.join(command)} \\
+    < /dev/null > {machine}/stdout 2> {machine}/stderr || status=$?
+echo $status > {machine}/status
+"""
+
+
+def _boot(init: Path, timeout_s: float) -> str:
+    """Run the kernel until it powers off, or kill it; what its console said."""
+    console = init.with_name("console")
+    with console.open("wb") as output:
+        kernel = subprocess.Popen(
+            [
+                *(KERNEL, f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro"),
+                *(f"init={init}", f"uml_dir={init.parent}/", "umid=guest"),
+                *("con=null", "con0=fd:0,fd:1", "quiet"),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env={"PATH": _path(), "TMPDIR": _memory_folder(init.parent)},
+            start_new_session=True,
+        )
+        try:
+            kernel.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(kernel.pid, signal.SIGKILL)
+            kernel.wait()
+    return console.read_text(errors="replace")
+
+
+def _memory_folder(otherwise: Path) -> str:
+    """Where the guest's memory lies as a file: in RAM where there is room for it."""
+    shared = Path("/dev/shm")
+    roomy = shared.is_dir() and shutil.disk_usage(shared).free > MEMORY_MB << 20
+    return str(shared if roomy else otherwise)
+
+
+def _path() -> str:
+    return os.environ["PATH"] + ":/usr/sbin:/sbin"
