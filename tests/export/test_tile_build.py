@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import subprocess
 import sys
@@ -24,10 +25,21 @@ TOWN10HD = DATA / "maps/town10hd/Town10HD.osm.gz"
 US101 = DATA / "ngsim/USA_US101-22_4_T-1.xml.gz"
 
 Write = Callable[[str], Path]
+Build = Callable[[], tuple[LaneMap, TileInfo, list[str]]]
 PLACES = {1: (0, 4), 2: (20, 4), 3: (0, 0), 4: (20, 0), 5: (40, 4), 6: (40, 0)}
 """Node -> x, y metres: two lanelets, 4 m wide and 20 m long, one after the other."""
 WAYS = {11: (1, 2), 12: (3, 4), 13: (2, 5), 14: (4, 6)}
 TAGS = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
+
+
+@functools.cache
+def karlsruhe() -> tuple[LaneMap, TileInfo, list[str]]:
+    return build(KARLSRUHE)
+
+
+@functools.cache
+def town10hd() -> tuple[LaneMap, TileInfo, list[str]]:
+    return build(TOWN10HD)
 
 
 def build(source: Path, origin: Origin | None = None) -> tuple[LaneMap, TileInfo, list[str]]:
@@ -74,14 +86,14 @@ def write(tmp_path: Path) -> Write:
 
 
 @pytest.mark.parametrize(
-    ("source", "lanes", "two_way", "connections", "length_km"),
-    [(KARLSRUHE, 388, 60, 378, 5.17), (TOWN10HD, 204, 0, 232, 5.93)],
+    ("built", "lanes", "two_way", "connections", "length_km"),
+    [(karlsruhe, 388, 60, 378, 5.17), (town10hd, 204, 0, 232, 5.93)],
     ids=["Karlsruhe", "Town10HD"],
 )
 def test_real_lanelet2_maps_are_whole(
-    source: Path, lanes: int, two_way: int, connections: int, length_km: float
+    built: Build, lanes: int, two_way: int, connections: int, length_km: float
 ) -> None:
-    lane_map, _, skipped = build(source)
+    lane_map, _, skipped = built()
     assert skipped == []
     assert lane_map.num_lanes == lanes
     assert (lane_map.lane_id < 0).sum() == two_way
@@ -91,9 +103,9 @@ def test_real_lanelet2_maps_are_whole(
     assert abs(total_m / 1e3 - length_km) < 0.01
 
 
-@pytest.mark.parametrize("source", [KARLSRUHE, TOWN10HD], ids=["Karlsruhe", "Town10HD"])
-def test_real_lanes_join_and_lie_beside_each_other(source: Path) -> None:
-    lane_map, _, _ = build(source)
+@pytest.mark.parametrize("built", [karlsruhe, town10hd], ids=["Karlsruhe", "Town10HD"])
+def test_real_lanes_join_and_lie_beside_each_other(built: Build) -> None:
+    lane_map, _, _ = built()
     for lane in range(lane_map.num_lanes):
         line = lane_map.lane_points(lane)
         for successor in lane_map.successors_of(lane):
@@ -108,7 +120,7 @@ def test_real_lanes_join_and_lie_beside_each_other(source: Path) -> None:
 
 
 def test_a_lanelet_open_both_ways_gives_a_lane_each_way() -> None:
-    lane_map, _, _ = build(KARLSRUHE)
+    lane_map, _, _ = karlsruhe()
     index = {int(lane_id): lane for lane, lane_id in enumerate(lane_map.lane_id)}
     for lane_id in (i for i in index if i < 0):
         there, back = (lane_map.lane_points(index[i]) for i in (-lane_id, lane_id))
@@ -116,29 +128,31 @@ def test_a_lanelet_open_both_ways_gives_a_lane_each_way() -> None:
 
 
 def test_the_same_map_gives_the_same_bytes() -> None:
-    assert build_tile(KARLSRUHE, None, None) == build_tile(KARLSRUHE, None, None)
+    assert decode(build_tile(KARLSRUHE, None, None)[0], "")[1].tile_id == karlsruhe()[1].tile_id
 
 
-def test_the_origin_is_where_x_and_y_are_zero() -> None:
+def test_the_origin_is_where_x_and_y_are_zero(write: Write) -> None:
     """A thousandth of a degree of latitude is 111.2 m at 49 degrees, of longitude 73.1 m."""
-    here, info, _ = build(KARLSRUHE, (49.0, 8.42))
+    places = {1: (49.001, 8.42), 2: (49.001, 8.421), 3: (48.999, 8.42), 4: (48.999, 8.421)}
+    nodes = "".join(f'<node id="{n}" lat="{lat}" lon="{lon}"/>' for n, (lat, lon) in places.items())
+    lane_map, info, _ = build(write(osm(nodes, lanelet(21, 11, 12))), (49.0, 8.42))
     assert (info.origin_latitude_deg, info.origin_longitude_deg) == (49.0, 8.42)
-    north, _, _ = build(KARLSRUHE, (49.001, 8.42))
-    east, _, _ = build(KARLSRUHE, (49.0, 8.421))
-    lane = int(np.argmin(np.abs(here.points).sum(axis=1)))  # where the planes are parallel
-    np.testing.assert_allclose((here.points - north.points)[lane], [0.0, 111.2], atol=0.1)
-    np.testing.assert_allclose((here.points - east.points)[lane], [73.1, 0.0], atol=0.1)
+    np.testing.assert_allclose(lane_map.points[[0, -1]], np.array([[0, 0], [73.1, 0]]), atol=0.1)
+    moved, _, _ = build(write(osm(nodes, lanelet(21, 11, 12))), (48.999, 8.42))
+    np.testing.assert_allclose(
+        moved.points[[0, -1]], np.array([[0, 111.2], [73.1, 111.2]]), atol=0.1
+    )
 
 
 def test_without_an_origin_the_middle_of_the_map_is_zero() -> None:
-    _, info, _ = build(KARLSRUHE)
+    _, info, _ = karlsruhe()
     assert 49.0 < info.origin_latitude_deg < 49.01
     assert 8.41 < info.origin_longitude_deg < 8.46
 
 
 def test_a_map_around_latitude_and_longitude_zero_keeps_its_plane() -> None:
     """Town10HD spans 225 by 210 m around CARLA's own origin."""
-    lane_map, info, _ = build(TOWN10HD)
+    lane_map, info, _ = town10hd()
     assert np.isnan(info.origin_latitude_deg)
     np.testing.assert_allclose(lane_map.points.min(axis=0), [-114.6, -141.2], atol=0.1)
     np.testing.assert_allclose(lane_map.points.max(axis=0), [110.0, 68.7], atol=0.1)
@@ -193,11 +207,11 @@ def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
         ("<osm", "not XML"),
         ("<commonRoad/>", "the root is <commonRoad>, expected <osm> with nodes"),
         ("<osm version='0.6'/>", "expected <osm> with nodes"),
-        (osm('<node id="1" lat="" lon=""/>'), "a node has no latitude and longitude"),
+        (osm('<node id="1" lat="" lon=""/>'), "a node's place is ('', ''), expected two numbers"),
         (osm(LOCAL), "no lanes for vehicles"),
         (osm(LOCAL, lanelet(21, 11, 12, subtype="walkway")), "no lanes for vehicles"),
-        (osm(local_node(1, 2e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
-        (osm(LOCAL.replace('v="20"', 'v="twenty"'), *ROAD), "local_x and local_y"),
+        (osm(local_node(1, 4e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
+        (osm(LOCAL.replace('v="20"', 'v="twenty"'), *ROAD), "a node's place is ('twenty', '4')"),
     ],
 )
 def test_a_broken_map_is_one_line_that_names_the_file(

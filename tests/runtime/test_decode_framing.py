@@ -120,11 +120,9 @@ class TestCounted:
 
     def test_the_last_of_two_objects_with_one_id_counts(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTED)
-        (cycle,) = feed(
-            decoder,
-            [header(3), first(1, 0, 1), first(2, 0, 2), first(3, 0, 1)]
-            + [second(1, 4.0), second(2, 4.0), second(1, 5.0)],
-        )
+        firsts = [first(1, 0, 1), first(2, 0, 2), first(3, 0, 1)]
+        seconds = [second(1, 4.0), second(2, 4.0), second(1, 5.0)]
+        (cycle,) = feed(decoder, [header(3), *firsts, *seconds])
         assert cycle.position[:, 0].tolist() == [2.0, 3.0]
         assert cycle.length_m.tolist() == [4.0, 5.0]
         assert decoder.counters.invalid_objects == 1
@@ -187,6 +185,14 @@ class TestOptionalMessages:
         (lost, whole) = feed(decoder, self.cycle(2, second(7, 4.5)), at_s=2.0)
         assert np.isnan(lost.length_m).all()
         assert whole.length_m.tolist() == [4.5]
+
+    def test_cycles_that_were_cut_off_tell_nothing_about_what_comes(self, tmp_path: Path) -> None:
+        decoder = decoder_of(tmp_path, COUNTED)
+        for i in range(5):
+            feed(decoder, [header(2, i), first(10, 0, 7, counter=i)], at_s=float(i))
+        feed(decoder, self.cycle(5), at_s=5.0)
+        (cycle,) = feed(decoder, [second(7, 4.5)], at_s=5.002)
+        assert cycle.length_m.tolist() == [4.5]
 
     def test_empty_cycles_tell_nothing_about_what_comes(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTED)

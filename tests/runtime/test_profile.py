@@ -11,13 +11,25 @@ from eqrt.runtime.profile import builtin_profiles, load_profile
 from tiny_sensor import COUNTED, DBC, SENSOR, SLOTS, profile_of
 
 
-@pytest.mark.parametrize("name", ["ars408", "generic", "srr520", "toyota-rav4"])
+@pytest.mark.parametrize("name", builtin_profiles())
 def test_a_built_in_profile_loads_by_its_name(name: str) -> None:
     profile = load_profile(name)
-    assert name in builtin_profiles()
     assert profile.name == name
-    assert profile.sensors
-    assert profile.has_ego
+    assert profile.description
+    assert profile.sensors or profile.ego
+
+
+def test_the_sensors_we_promise_are_built_in() -> None:
+    assert {"ars408", "generic", "srr520", "toyota-rav4"} <= set(builtin_profiles())
+
+
+def test_two_sources_of_latitude_and_longitude_are_refused(tmp_path: Path) -> None:
+    ego = (
+        '[[ego]]\nbus = "car"\ndbc = "tiny.dbc"\nmessages = { p = "POLAR" }\n'
+        'fields = { latitude = "ANGLE", longitude = "ANGLE", heading = "ANGLE" }\n'
+    )
+    with pytest.raises(ProfileError, match=r"more than one \[\[ego\]\] gives latitude and long"):
+        profile_of(tmp_path, 'description = "two"\n' + ego + ego)
 
 
 def test_a_profile_is_loaded_from_a_path(tmp_path: Path) -> None:
@@ -183,8 +195,9 @@ def test_a_dbc_with_a_broken_comment_is_used_without_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ("{}", "fields must have speed, yaw_rate, or a pose of x, y and yaw"),
-        ('{ x = "LEFT", y = "LEFT" }', "a pose needs x, y and yaw; fields has only x and y"),
+        ("{}", "fields must have speed, yaw_rate, or a pose"),
+        ('{ x = "LEFT", y = "LEFT" }', "a pose needs x, y, yaw, and fields has only some of"),
+        ('{ latitude = "LEFT" }', "a pose needs latitude, longitude, heading, and fields has"),
         ('{ reverse = "LEFT < 0", yaw_rate = "YAW_RATE" }', "turns fields.speed around, which is"),
         ("{ speed = { mean = [] } }", "fields.speed: mean is empty; name the signals"),
         ('{ speed = "YAW_RATE" }', "fields.speed: the DBC gives YAW_RATE the unit 'deg/s'; add"),

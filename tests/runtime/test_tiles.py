@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -95,3 +97,16 @@ def test_a_wrong_action_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> No
         main(["tile", "bild", "a"])
     assert caught.value.code == 2
     assert "invalid choice: 'bild'" in capsys.readouterr().err
+
+
+def test_where_only_the_runtime_is_installed_build_says_so(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules['eqrt.export'] = None; from eqrt.cli import main; "
+        "sys.exit(main(['tile', 'build', 'a.osm', '--out', 'x']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], check=False, capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("eqrt: eqrt tile build needs 'eqrt.export")
+    assert done.stderr.count("\n") == 1

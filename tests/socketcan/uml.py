@@ -55,6 +55,8 @@ mount -t proc proc /proc
 mount -t sysfs sysfs /sys
 mkdir -p /dev/shm
 mount -t tmpfs tmpfs /dev/shm
+# On a busy machine the guest stands still for seconds: no message may be lost meanwhile.
+echo 8388608 > /proc/sys/net/core/rmem_default
 mount -t hostfs -o {shlex.quote(str(work))} none {shlex.quote(str(work))}
 {drivers}
 {SETUP}

@@ -11,13 +11,9 @@ from eqrt.training.checkpoint import load_checkpoint
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt export`."""
-    parser.add_argument(
-        "checkpoint", type=Path, help="model.safetensors of `eqrt train`"
-    )
+    parser.add_argument("checkpoint", type=Path, help="model.safetensors of `eqrt train`")
     parser.add_argument("--out", type=Path, required=True, help="folder of the artifact")
-    parser.add_argument(
-        "--model-version", default="1.0.0", help="default 1.0.0"
-    )
+    parser.add_argument("--model-version", default="1.0.0", help="default 1.0.0")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -45,7 +45,7 @@ def keep_lanelets(root: Element) -> list[str]:
     kept = {"way": ways, "relation": limits}
     dropped = []
     for child in list(root):
-        if child.tag == "relation" and _kind(child, "type") == "lanelet":
+        if child.tag == "relation" and tag_value(child, "type") == "lanelet":
             if fault := _fault(child, ways):
                 dropped.append(f"lanelet {child.get('id')} {fault}")
                 root.remove(child)
@@ -53,6 +53,12 @@ def keep_lanelets(root: Element) -> list[str]:
         elif child.get("id") not in kept.get(child.tag, nodes):
             root.remove(child)
     return dropped
+
+
+def tag_value(element: Element, key: str) -> str | None:
+    """What an element's tag says."""
+    tag = element.find(f"tag[@k='{key}']")
+    return None if tag is None else tag.get("v")
 
 
 def _is_line(way: Element, nodes: set[str | None]) -> bool:
@@ -63,18 +69,13 @@ def _is_line(way: Element, nodes: set[str | None]) -> bool:
 def _is_limit(relation: Element, ways: set[str | None]) -> bool:
     """Whether a relation is a speed limit, written as a regulatory element, whole."""
     return (
-        _kind(relation, "type") == "regulatory_element"
-        and _kind(relation, "subtype") == "speed_limit"
+        tag_value(relation, "type") == "regulatory_element"
+        and tag_value(relation, "subtype") == "speed_limit"
         and all(
             member.get("type") == "way" and member.get("ref") in ways
             for member in relation.findall("member")
         )
     )
-
-
-def _kind(element: Element, key: str) -> str | None:
-    tag = element.find(f"tag[@k='{key}']")
-    return None if tag is None else tag.get("v")
 
 
 def _fault(lanelet: Element, ways: set[str | None]) -> str | None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from eqrt.core.errors import TileError, UsageError
 from eqrt.core.lanes import Lane, LaneMap, LaneType, build_lane_map, middle_line
 from eqrt.core.tile import TileInfo, decode, encode
-from eqrt.export.osm import keep_lanelets, read_osm
+from eqrt.export.osm import keep_lanelets, read_osm, tag_value
 from eqrt.training.commonroad import lane_map as commonroad_lane_map
 from eqrt.training.commonroad import read_scenario
 
@@ -77,7 +77,7 @@ def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
     lanelet2 = _import_lanelet2()
     root = read_osm(source)
     skipped = keep_lanelets(root)
-    planar = _move_to_plane(root, lanelet2) or _near_null_island(_middle(root, source))
+    planar = _move_to_plane(root, source, lanelet2) or _near_null_island(_middle(root, source))
     projected_from = (0.0, 0.0) if planar else origin or _middle(root, source)
     projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*projected_from))
     with tempfile.TemporaryDirectory() as folder:
@@ -105,16 +105,20 @@ def _import_lanelet2() -> Any:
 
 def _middle(root: ElementTree.Element, source: Path) -> Origin:
     """The middle of all nodes, to the seventh decimal (a centimetre)."""
-    try:
-        places = np.array(
-            [(float(node.get("lat", "")), float(node.get("lon", ""))) for node in root.iter("node")]
-        )
-    except ValueError as error:
-        raise TileError(
-            f"{source}: a node has no latitude and longitude, and no local_x and local_y either"
-        ) from error
+    nodes = root.findall("node")
+    places = np.array([_numbers((node.get("lat"), node.get("lon")), source) for node in nodes])
     latitude_deg, longitude_deg = (places.min(axis=0) + places.max(axis=0)) / 2.0
     return round(float(latitude_deg), 7), round(float(longitude_deg), 7)
+
+
+def _numbers(texts: tuple[str | None, str | None], source: Path) -> tuple[float, float]:
+    try:
+        return float(texts[0] or ""), float(texts[1] or "")
+    except ValueError as error:
+        raise TileError(
+            f"{source}: a node's place is {texts}, expected two numbers: latitude and longitude, "
+            "or local_x and local_y on every node"
+        ) from error
 
 
 def _near_null_island(middle: Origin) -> bool:
@@ -122,19 +126,19 @@ def _near_null_island(middle: Origin) -> bool:
     return max(map(abs, middle)) < 0.5  # degrees, 55 km
 
 
-def _move_to_plane(root: ElementTree.Element, lanelet2: Any) -> bool:
+def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bool:
     """Whether all nodes have `local_x` and `local_y`; if so, they become the nodes' places.
 
     The library projects latitude and longitude whatever the file says, so they are set to what it
     will turn back into the local values.
     """
     nodes = root.findall("node")
-    places = [(node.find("tag[@k='local_x']"), node.find("tag[@k='local_y']")) for node in nodes]
-    if any(x is None or y is None for x, y in places):
+    texts = [(tag_value(node, "local_x"), tag_value(node, "local_y")) for node in nodes]
+    if any(None in pair for pair in texts):
         return False
     projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(0.0, 0.0))
-    for node, place in zip(nodes, places, strict=True):
-        x_m, y_m = (float(tag.get("v", "")) for tag in place if tag is not None)
+    for node, pair in zip(nodes, texts, strict=True):
+        x_m, y_m = _numbers(pair, source)
         point = projector.reverse(lanelet2.core.BasicPoint3d(x_m, y_m, 0.0))
         node.attrib.update(lat=f"{point.lat:.12f}", lon=f"{point.lon:.12f}")
         for tag in node.findall("tag[@k='ele']"):

@@ -90,15 +90,9 @@ class LaneGrid:
     def _nearest(self, places: Complex, run: Index) -> Index:
         """(C,) index of each run's point nearest to its place (C,)."""
         count = self._count[run]
-        start = np.cumsum(count) - count
-        if not len(start):
-            return start
         point = ranges(self._first[run], count)
         away = self._lines.points[point] - np.repeat(places, count)
-        square = away.real**2 + away.imag**2
-        least = np.minimum.reduceat(square, start)
-        hit = np.flatnonzero(square == np.repeat(least, count))
-        return point[hit[np.searchsorted(hit, start)]]
+        return point[_least(away.real**2 + away.imag**2, np.cumsum(count) - count)]
 
     def _project(self, place: Index, places: Complex, lane: Index, point: Index) -> NearLanes:
         """Nearest place on the two segments at each of the points (C,)."""
@@ -134,10 +128,20 @@ def ranges(begin: Index, count: Index) -> Index:
     return np.arange(end[-1] if len(end) else 0) + np.repeat(begin - end + count, count)
 
 
-def least_of_each(group: Index, value: Float64) -> Index:
-    """Index of the least value of each group, by rising group."""
-    order = np.lexsort((value, group))
-    return order[np.flatnonzero(np.diff(group[order], prepend=-1))]
+def least_of_each(group: Index, metres: Float64) -> Index:
+    """Index of the least of each group, by rising group; of equal ones, the first."""
+    order = np.argsort(group, kind="stable")
+    start = np.flatnonzero(np.diff(group[order], prepend=-1))
+    return order[_least(metres[order], start)]
+
+
+def _least(values: Float64, start: Index) -> Index:
+    """Index of the first least value of each stretch; stretches begin at `start`."""
+    if not len(start):
+        return start
+    least = np.minimum.reduceat(values, start)
+    hit = np.flatnonzero(values == np.repeat(least, np.diff(start, append=len(values))))
+    return hit[np.searchsorted(hit, start)]
 
 
 def _cells(places: Complex) -> tuple[Float64, Float64]:

@@ -11,9 +11,9 @@ Axes: A targets, Q centerlines, L points. Metres, map frame.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Iterator
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -132,43 +132,32 @@ class RouteFinder:
 
     def _sample(self, chosen: list[_Choice], centerline_points: int) -> tuple[Complex, Bool]:
         """Points (R, L) and valid (R, L) of R chosen routes."""
-        even = np.linspace(-BEHIND_M, AHEAD_M, centerline_points)
-        legs = _Legs([], [], [])
-        for route, along_m in chosen:
-            first = max(0, bisect_right(route.starts_m, along_m - BEHIND_M) - 1)
-            end = max(first + 1, bisect_right(route.starts_m, along_m + even[-1]))
-            legs.lane.extend(route.lanes[first:end])
-            legs.start_m.extend(route.starts_m[first:end])
-            legs.per_route.append(end - first)
+        routes = [route for route, _ in chosen]
         here = np.array([along_m for _, along_m in chosen])
+        even = np.linspace(-BEHIND_M, AHEAD_M, centerline_points)
         along = here[:, None] + even  # (R, L)
-        leg, start = _leg_of_sample(legs, here, even)
-        points = self._lines.at(np.array(legs.lane)[leg], along - start[leg])
-        begin = np.array([route.starts_m[0] for route, _ in chosen])[:, None]
-        finish = np.array([route.end_m for route, _ in chosen])[:, None]
-        return points, (along >= begin) & (along <= finish)
+        lane, start = _legs_of_samples(routes, here, even)
+        points = self._lines.at(lane, along - start)
+        begin = np.array([route.starts_m[0] for route in routes])[:, None]
+        end = np.array([route.end_m for route in routes])[:, None]
+        return points, (along >= begin) & (along <= end)
 
 
-class _Legs(NamedTuple):
-    """The legs of chosen routes within reach, route after route."""
-
-    lane: list[int]
-    start_m: list[float]
-    per_route: list[int]
-    """How many legs each route has."""
-
-
-def _leg_of_sample(legs: _Legs, here: Float64, even: Float64) -> tuple[Index, Float64]:
-    """Index into `legs` of every sample (R, L), and where each leg starts.
+def _legs_of_samples(routes: list[Route], here: Float64, even: Float64) -> tuple[Index, Float64]:
+    """Lane of every sample (R, L), and where that leg starts along its route (R, L).
 
     Each leg begins at some sample; counting the beginnings up to a sample gives its leg.
     """
-    count, start = np.array(legs.per_route), np.array(legs.start_m)
-    row = np.repeat(np.arange(len(count)), count)
-    begins = np.minimum(np.searchsorted(even, start - here[row]), len(even) - 1)
-    begins[np.cumsum(count) - count] = 0  # a route that begins within reach is not valid before
-    begun = np.bincount(row * len(even) + begins, minlength=len(count) * len(even))
-    return (np.cumsum(begun) - 1).reshape(len(count), len(even)), start
+    count = np.array([len(route.lanes) for route in routes])
+    lane = np.fromiter(chain.from_iterable(route.lanes for route in routes), np.int64)
+    start = np.fromiter(chain.from_iterable(route.starts_m for route in routes), np.float64)
+    row = np.repeat(np.arange(len(routes)), count)
+    begins = np.searchsorted(even, start - here[row])
+    begins[np.cumsum(count) - count] = 0  # before a route's beginning nothing is valid
+    within = begins < len(even)
+    begun = np.bincount((row * len(even) + begins)[within], minlength=len(routes) * len(even))
+    leg = (np.cumsum(begun) - 1).reshape(len(routes), len(even))
+    return lane[within][leg], start[within][leg]
 
 
 def _in_order(near: NearLanes, directions: Complex, num_targets: int) -> Iterator[_Around]:

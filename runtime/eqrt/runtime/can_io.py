@@ -10,6 +10,7 @@ Nothing on the bus raises: what cannot be used is counted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
@@ -21,6 +22,7 @@ from eqrt.runtime.dbc_tables import Payload
 from eqrt.runtime.decoder_counters import DecoderCounters
 from eqrt.runtime.detections import Detections, EgoMotion, EgoPose
 from eqrt.runtime.ego_messages import EgoDecoder
+from eqrt.runtime.geodesy import MapOrigin
 from eqrt.runtime.objects import ObjectDecoder
 from eqrt.runtime.profile import Profile
 from eqrt.runtime.sensor_profile import SensorProfile
@@ -39,10 +41,18 @@ _UNREADABLE = b""  # stands for a message that came, but damaged
 class Decoder:
     """Takes the messages of all buses, gives what each of them completes."""
 
-    def __init__(self, profile: Profile, channels: Mapping[str, str | int] | None = None) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        channels: Mapping[str, str | int] | None = None,
+        map_origin_deg: tuple[float, float] | None = None,
+    ) -> None:
         """`channels`: role of a bus in the profile -> its channel; None = every role is anywhere.
 
-        Raises UsageError if a role has no channel, or there is no such role.
+        A message that does not say its channel (None) is taken for any. `map_origin_deg`: latitude
+        and longitude of the map's origin; None = where the first pose is, NaN = the map does not
+        say, and poses by latitude and longitude are of no use. Raises UsageError if a role has no
+        channel, or there is no such role.
         """
         self.counters = DecoderCounters()
         self.arbitration_ids = profile.arbitration_ids
@@ -53,8 +63,9 @@ class Decoder:
         for sensor in self._sensors:
             for address, take in sensor.inputs():
                 self._add_route(address, accepted[sensor.profile.bus], take)
+        origin = None if map_origin_deg is None else MapOrigin(*map(math.radians, map_origin_deg))
         for ego in profile.ego:
-            decoder = EgoDecoder(ego)
+            decoder = EgoDecoder(ego, origin)
             for i, part in enumerate(ego.parts):
                 self._add_route(part.address, accepted[ego.bus], partial(decoder.add, i))
 
@@ -162,7 +173,7 @@ class _SensorInput:
         return detections
 
 
-_Channels = frozenset[str | int] | None
+_Channels = frozenset[str | int | None] | None
 """What `can.Message.channel` may be; None = anything."""
 
 
@@ -170,7 +181,7 @@ def _accepted_channels(
     profile: Profile, channels: Mapping[str, str | int] | None
 ) -> dict[str, _Channels]:
     """By role."""
-    if channels is None:
+    if not channels:
         return dict.fromkeys(profile.roles)
     for role in channels.keys() ^ set(profile.roles):
         problem = "no bus" if role in channels else "no channel for its bus"
@@ -182,10 +193,10 @@ def _accepted_channels(
     return {role: _spellings(channel) for role, channel in channels.items()}
 
 
-def _spellings(channel: str | int) -> frozenset[str | int]:
+def _spellings(channel: str | int) -> frozenset[str | int | None]:
     """python-can calls a numbered channel 1 or '1', as the interface or log format has it."""
     text = str(channel)
-    return frozenset({text, int(text)} if text.isdecimal() else {text})
+    return frozenset({text, None} | ({int(text)} if text.isdecimal() else set()))
 
 
 def _is_data(message: can.Message, routes: Sequence[_Route]) -> bool:

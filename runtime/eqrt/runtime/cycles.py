@@ -119,10 +119,12 @@ class Framing(ABC):
 
     def _learn(self) -> None:
         """Which optional messages this sensor sends at all: some are sent only if configured."""
+        came = [sum(data is not None for data in part) for part in self._payloads]
+        if not came[0] or came[0] < self._most[0]:
+            return  # empty, or cut off: tells nothing
         for i, part in enumerate(self._sensor.parts):
-            if part.optional and self._most[i]:
-                came = any(data is not None for data in self._payloads[i])
-                self._absences[i] = 0 if came else self._absences[i] + 1
+            if part.optional:
+                self._absences[i] = 0 if came[i] else self._absences[i] + 1
                 self._awaits[i] = self._absences[i] < _PATIENCE
 
     def _stray(self, part: int) -> None:

@@ -8,6 +8,7 @@ from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.runtime.dbc_tables import Payload
 from eqrt.runtime.detections import EgoMotion, EgoPose
 from eqrt.runtime.ego_profile import EgoProfile
+from eqrt.runtime.geodesy import MapOrigin
 
 _NEVER = float("-inf")
 _NAN = float("nan")
@@ -16,8 +17,10 @@ _NAN = float("nan")
 class EgoDecoder:
     """Decodes the messages of one `[[ego]]` of the profile."""
 
-    def __init__(self, profile: EgoProfile) -> None:
+    def __init__(self, profile: EgoProfile, origin: MapOrigin | None) -> None:
+        """`origin`: of the map, for latitudes and longitudes; None = the first of them is it."""
         self._profile = profile
+        self._origin = origin
         self._values = [[_NAN] * len(part.columns) for part in profile.parts]
         self._arrived_s = [_NEVER] * len(profile.parts)
 
@@ -45,11 +48,28 @@ class EgoDecoder:
             events.append(
                 EgoMotion(timestamp_s=timestamp_s, speed_mps=speed, yaw_rate_rad_s=yaw_rate)
             )
-        x, y, yaw = self._number("x"), self._number("y"), self._number("yaw")
-        if x is not None and y is not None and yaw is not None:
-            pose = Pose2(x, y, wrap_angle(yaw))
+        pose = self._map_pose() or self._geodetic_pose()
+        if pose is not None:
             events.append(EgoPose(timestamp_s=timestamp_s, map_from_ego=pose))
         return events
+
+    def _map_pose(self) -> Pose2 | None:
+        x, y, yaw = self._number("x"), self._number("y"), self._number("yaw")
+        if x is None or y is None or yaw is None:
+            return None
+        return Pose2(x, y, wrap_angle(yaw))
+
+    def _geodetic_pose(self) -> Pose2 | None:
+        latitude, longitude = self._number("latitude"), self._number("longitude")
+        heading = self._number("heading")
+        if latitude is None or longitude is None or heading is None:
+            return None
+        if abs(latitude) > math.pi / 2.0 or abs(longitude) > math.pi:
+            return None
+        if self._origin is None:
+            self._origin = MapOrigin(latitude, longitude)
+        pose = self._origin.pose(latitude, longitude, heading)
+        return pose if math.isfinite(pose.x_m) else None
 
     def _number(self, key: str) -> float | None:
         field = self._profile.numbers.get(key)

@@ -18,9 +18,12 @@ _MEASURES = {
     "x": "length",
     "y": "length",
     "yaw": "angle",
+    "latitude": "angle",
+    "longitude": "angle",
+    "heading": "angle",
     "age": "time",
 }
-_POSE = ("x", "y", "yaw")
+_POSES = (("x", "y", "yaw"), ("latitude", "longitude", "heading"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +43,8 @@ class EgoProfile:
     parts: tuple[EgoPart, ...]
     """The last one's arrival tells; what the others said counts for `hold_s`."""
     numbers: Mapping[str, BoundField]
-    """Keys as in the profile: speed, yaw_rate, x, y, yaw, age. SI, counter-clockwise positive."""
+    """Keys as in the profile, values in SI units; heading is clockwise from north, other angles and
+    rates counter-clockwise."""
     reverse: BoundCondition | None
     """Where it holds, the speed is backward."""
     valid: BoundCondition | None
@@ -98,14 +102,16 @@ def _part(
 
 def _check(table: EgoTable, where: str) -> None:
     fields = table.fields
-    pose = [key for key in _POSE if getattr(fields, key) is not None]
+    given = {key for key in _MEASURES if getattr(fields, key) is not None}
     problem = None
     if not table.messages:
         problem = "messages is empty; name the messages"
-    elif fields.speed is None and fields.yaw_rate is None and not pose:
-        problem = "fields must have speed, yaw_rate, or a pose of x, y and yaw"
-    elif 0 < len(pose) < len(_POSE):
-        problem = f"a pose needs x, y and yaw; fields has only {' and '.join(pose)}"
+    elif not given - {"age"}:
+        problem = "fields must have speed, yaw_rate, or a pose"
+    elif halves := [pose for pose in _POSES if given & set(pose) and not given >= set(pose)]:
+        problem = f"a pose needs {', '.join(halves[0])}, and fields has only some of them"
+    elif all(given & set(pose) for pose in _POSES):
+        problem = "there are two poses; give x, y, yaw or latitude, longitude, heading"
     elif fields.reverse is not None and fields.speed is None:
         problem = "fields.reverse turns fields.speed around, which is missing"
     elif not 0.0 <= table.latency_s <= MAX_TIME_S:

@@ -101,7 +101,8 @@ class ObjectDecoder:
         counter = _NAN
         if header.counter is not None:
             counter = values[0][header.counter.column.row]
-            self._check_step(counter, header.counter.modulus, header.counter_steps)
+            if not math.isnan(counter):
+                self._check_step(counter, header.counter.modulus, header.counter_steps)
         return counter, age_s if age_s > 0.0 else 0.0
 
     def _check_step(self, counter: float, modulus: int, steps: Sequence[int]) -> None:
@@ -134,16 +135,16 @@ class ObjectDecoder:
             values = values.reshape(shape).transpose(0, 2, 1).reshape(shape[0], -1)
         if part.counter is not None:
             seen = values[part.counter.column.row]
-            if self._sensor.header is None:
-                counter = self._counter_of_slots(index, seen, part.counter.modulus)
+            if math.isnan(counter):
+                counter = self._counter_without_header(index, seen, part.counter.modulus)
             other = (seen != counter % part.counter.modulus) & ~np.isnan(seen)
             if other.any():
                 self._counters.bad_counter += int(other.sum())
                 values[:, other] = _NAN
         return values
 
-    def _counter_of_slots(self, index: int, seen: Float64, modulus: int) -> float:
-        """The counter that a cycle without header goes by: that of its first slot."""
+    def _counter_without_header(self, index: int, seen: Float64, modulus: int) -> float:
+        """What a cycle goes by whose header has no counter: that of its first message."""
         there = seen[~np.isnan(seen)]
         counter = float(there[0]) if len(there) else _NAN
         if index == 0 and len(there):

@@ -100,6 +100,8 @@ def _problem(table: ProfileTable) -> str | None:
     for name in names:
         if names.count(name) > 1:
             return f"more than one sensor has the name {name!r}; names must be unique"
+    if sum(ego.fields.latitude is not None for ego in table.ego) > 1:
+        return "more than one [[ego]] gives latitude and longitude; keep one"
     if not abs(table.yaw_rate_bias_deg_s) <= _MAX_BIAS_DEG_S:
         bias = table.yaw_rate_bias_deg_s
         return f"yaw_rate_bias_deg_s is {bias}, expected at most {_MAX_BIAS_DEG_S:g} either way"

@@ -168,6 +168,9 @@ class EgoFieldsTable:
     x: str | FieldTable | None = None
     y: str | FieldTable | None = None
     yaw: str | FieldTable | None = None
+    latitude: str | FieldTable | None = None
+    longitude: str | FieldTable | None = None
+    heading: str | FieldTable | None = None
     age: str | FieldTable | None = None
     valid: str | None = None
 

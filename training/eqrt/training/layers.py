@@ -179,7 +179,9 @@ class GatedVectorMlp(nn.Module):
     def __init__(self, sizes: list[int], width: int) -> None:
         super().__init__()
         pairs = list(pairwise(sizes))
-        self.mix = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in pairs)
+        layers = [nn.Linear(a, b, bias=False) for a, b in pairs]
+        nn.init.zeros_(layers[-1].weight)  # training starts from no output at all
+        self.mix = nn.ModuleList(layers)
         self.gate = nn.ModuleList(nn.Linear(width, b) for _, b in pairs)
         self.nonlinearity = nn.ModuleList(VectorNonlinearity(b) for _, b in pairs[:-1])
 

@@ -41,6 +41,8 @@ SLOPE_STEPS = (5, 10, 20)
 """Velocity is fitted over the last half, one and two seconds."""
 
 
+COURSE = 1
+"""Index in SLOPE_STEPS of the mean course."""
 BASIS = 6
 """Smooth functions of time that a trajectory is made of."""
 
@@ -127,7 +129,7 @@ class EquivariantPredictor(nn.Module):
             geometric, pattern = layer(geometric, pattern, pairs)
 
         trajectories, probabilities = self.decoder(
-            geometric[:, 0], pattern[:, 0], motion.velocity[:, 0]
+            geometric[:, 0], pattern[:, 0], motion.velocity[:, 0], motion.deviation
         )
         return origin[:, None, None, :] + UNIT_M * trajectories, probabilities
 
@@ -161,6 +163,11 @@ class EquivariantPredictor(nn.Module):
         return geometric, pattern
 
 
+def deviations(config: ModelConfig) -> int:
+    """V, the vectors that say how a history deviates from its mean course."""
+    return 2 * config.history_steps - 1 + len(SLOPE_STEPS)
+
+
 @dataclass(frozen=True, slots=True)
 class MotionFeatures:
     """What the agents' histories say."""
@@ -171,6 +178,8 @@ class MotionFeatures:
     """(B, N, D)"""
     velocity: Tensor
     """(B, N, 2, S) velocities fitted over SLOPE_STEPS, network units per second."""
+    deviation: Tensor
+    """(B, 2, V) how the target's history deviates from its mean course: vectors, see MotionInit."""
 
 
 class MotionInit(nn.Module):
@@ -178,13 +187,22 @@ class MotionInit(nn.Module):
 
     Geometric: bias-free mixing of the steps of each history. Pattern: speeds, changes of speed and
     direction between steps, which steps were seen.
+
+    A history is taken apart into its mean course (the velocity fitted over a second) and how it
+    deviates from it. The deviations are where braking and turning show; they are centimetres beside
+    tens of metres, so they are handed on in metres, not in network units.
     """
+
+    time: Tensor
+    """(T,) seconds, the last is 0."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         steps = config.history_steps
         self.dt_s = config.dt_s
-        self.mix = nn.Linear(2 * steps - 1 + len(SLOPE_STEPS), config.channels, bias=False)
+        time = torch.arange(1 - steps, 1) * config.dt_s
+        self.register_buffer("time", time, persistent=False)
+        self.mix = nn.Linear(deviations(config) + 1, config.channels, bias=False)
         self.gate = nn.Linear(config.width, config.channels)
         invariants = steps + (steps - 1) + 2 * (steps - 2) + 3 * len(SLOPE_STEPS)
         self.pattern = mlp([invariants, config.width, config.width])
@@ -195,16 +213,19 @@ class MotionInit(nn.Module):
         both = valid[..., 1:] & valid[..., :-1]  # (B, N, T - 1)
         step = (relative[..., 1:] - relative[..., :-1]) * both.unsqueeze(2) / self.dt_s
         slopes = self._slopes(relative, valid)  # (B, N, 2, S)
+        course = slopes[..., COURSE : COURSE + 1]  # (B, N, 2, 1)
+        off_course = (relative - course * self.time) * valid.unsqueeze(2)
+        change = (step - course) * both.unsqueeze(2)
+        deviation = UNIT_M * torch.cat([off_course, change, slopes - course], -1)  # (B, N, 2, V)
         pattern = self.pattern(self._invariants(step, slopes, valid))
-        mixed = self.mix(torch.cat([relative, step, slopes], -1))  # (B, N, 2, C)
+        mixed = self.mix(torch.cat([course, deviation], -1))  # (B, N, 2, C)
         mixed = mixed * (1.0 + self.gate(pattern).unsqueeze(-2))
         place = ((last - last[:, :1]) / UNIT_M) * valid.any(-1).unsqueeze(-1)  # (B, N, 2)
-        return MotionFeatures(mixed + place.unsqueeze(-1), pattern, slopes)
+        return MotionFeatures(mixed + place.unsqueeze(-1), pattern, slopes, deviation[:, 0])
 
     def _slopes(self, relative: Tensor, valid: Tensor) -> Tensor:
         """Least-squares velocities (B, N, 2, S) over the seen steps of each window; 0 for one."""
-        steps = relative.shape[-1]
-        time = torch.arange(1 - steps, 1, dtype=relative.dtype, device=relative.device) * self.dt_s
+        time = self.time
         window = torch.stack([(time > -(n - 0.5) * self.dt_s).to(time) for n in SLOPE_STEPS])
         weight = valid.unsqueeze(-2).to(relative.dtype) * window  # (B, N, S, T)
         count = weight.sum(-1, keepdim=True).clamp(min=1.0)
@@ -222,11 +243,11 @@ class MotionInit(nn.Module):
             [
                 valid.to(step.dtype),
                 length(step),
-                dot(after - before, before) / speed,
-                cross(before, after) / speed,
+                dot(after - before, before) * (UNIT_M / speed),  # m/s per step, along
+                cross(before, after) * (UNIT_M / speed),  # and across
                 length(slopes),
                 dot(slopes, other),
-                cross(slopes, other),
+                cross(slopes, other) * UNIT_M,
             ],
             -1,
         )
@@ -239,14 +260,22 @@ class Decoder(nn.Module):
     draw, it need not learn to avoid.
 
     The course is a bias-free mixture of the target's own fitted velocities, chosen by its pattern
-    features, so it turns with the world like everything else here.
+    features; how it deviated from its course so far carries on linearly; the rest is the gated
+    perceptron's. All of it turns with the world.
     """
+
+    time: Tensor
+    """(H,) seconds."""
+    basis: Tensor
+    """(BASIS, H)"""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.modes, self.steps = config.num_modes, config.horizon_steps
         hidden, width = config.channels, config.width
         self.vectors = GatedVectorMlp([hidden, hidden, hidden, hidden, self.modes * BASIS], width)
+        self.carry_on = nn.Linear(deviations(config), self.modes * BASIS, bias=False)
+        nn.init.zeros_(self.carry_on.weight)  # training starts from the mean course
         self.course = nn.Linear(width, len(SLOPE_STEPS))
         self.logits = mlp([width, width, self.modes])
         time = torch.arange(1, self.steps + 1) * config.dt_s
@@ -254,17 +283,17 @@ class Decoder(nn.Module):
         self.register_buffer("basis", _basis(self.steps), persistent=False)
 
     def forward(
-        self, geometric: Tensor, pattern: Tensor, velocity: Tensor
+        self, geometric: Tensor, pattern: Tensor, velocity: Tensor, deviation: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Geometric (B, 2, C), pattern (B, D), velocity (B, 2, S).
+        """Geometric (B, 2, C), pattern (B, D), velocity (B, 2, S), deviation (B, 2, V).
 
         Returns trajectories (B, K, H, 2) relative to the target, network units, and probabilities
         (B, K); the most probable mode first.
         """
         share = self.course(pattern).softmax(-1).unsqueeze(-2)  # (B, 1, S)
         course = (velocity * share).sum(-1, keepdim=True) * self.time  # (B, 2, H)
-        coefficients = self.vectors(geometric, pattern).unflatten(-1, (self.modes, BASIS))
-        offset = coefficients @ self.basis  # (B, 2, K, H)
+        coefficients = self.vectors(geometric, pattern) + self.carry_on(deviation)
+        offset = coefficients.unflatten(-1, (self.modes, BASIS)) @ self.basis  # (B, 2, K, H)
         trajectories = (course.unsqueeze(2) + offset).permute(0, 2, 3, 1)
         probabilities = self.logits(pattern).softmax(-1)
         if self.modes == 1:
