@@ -61,9 +61,7 @@ def _run_command(name: str, argv: list[str]) -> int:
         if extra is None:
             raise
         raise missing_extra(f"eqrt {name}", error.name or "", extra) from error
-    parser = argparse.ArgumentParser(
-        prog=f"eqrt {name}", description=summary, allow_abbrev=False
-    )
+    parser = argparse.ArgumentParser(prog=f"eqrt {name}", description=summary, allow_abbrev=False)
     module.add_arguments(parser)
     return int(module.run(parser.parse_args(argv)))
 

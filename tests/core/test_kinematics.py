@@ -11,7 +11,7 @@ DT_S = 0.1
 def straight(steps: int = 20, velocity: tuple[float, float] = (10.0, -2.0)) -> np.ndarray:
     """(1, T, 2) positions that end at the origin."""
     time = (np.arange(steps) - steps + 1) * DT_S
-    return (time[:, None] * np.array(velocity))[None]
+    return np.asarray((time[:, None] * np.array(velocity))[None])
 
 
 def test_constant_velocity_goes_on_as_the_last_half_second_went() -> None:
@@ -69,5 +69,5 @@ def test_standing_and_short_histories_do_not_turn() -> None:
     history = np.full((2, 20, 2), np.nan)
     history[valid] = 5.0
     velocity, turn_rate = fit_motion(history, valid, DT_S)
-    np.testing.assert_array_equal(velocity, 0.0)
+    np.testing.assert_allclose(velocity, 0.0, atol=1e-12)
     np.testing.assert_array_equal(turn_rate, 0.0)

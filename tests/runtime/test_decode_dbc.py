@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import eqrt.runtime.profile
-from eqrt.runtime.dbc_tables import Column, Dbc, SignalTable, load_dbc
+from eqrt.runtime.dbc_files import Dbc, load_dbc
+from eqrt.runtime.dbc_tables import Column, SignalTable
 
 FOLDER = Path(eqrt.runtime.profile.__file__).parent / "dbc"
 SHIPPED = [

@@ -20,7 +20,7 @@ from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.runtime import generic_objects
 from eqrt.runtime.can_io import Decoder, Event
 from eqrt.runtime.detections import Detections, EgoMotion, EgoPose, ObjectClass, VelocityKind
-from eqrt.runtime.generic_objects import ObjectIds, encode_cycle
+from eqrt.runtime.generic_objects import encode_cycle
 from eqrt.runtime.profile import load_profile
 
 Float64 = NDArray[np.float64]
@@ -220,20 +220,3 @@ def test_object_classes_have_the_same_numbers_everywhere() -> None:
     assert {number: str(name) for number, name in choices.items()} == {
         kind.value: kind.name.lower() for kind in ObjectClass
     }
-
-
-def test_object_ids_stay_with_their_tracks_and_are_reused_late() -> None:
-    ids = ObjectIds()
-    first, is_new = ids.assign([1000, 2000])
-    assert (first.tolist(), is_new.tolist()) == ([0, 1], [True, True])
-    second, is_new = ids.assign([2000, 3000])
-    assert (second.tolist(), is_new.tolist()) == ([1, 2], [False, True])
-    again, is_new = ids.assign([1000, 2000])
-    assert (again.tolist(), is_new.tolist()) == ([3, 1], [True, False])
-
-
-def test_object_ids_suffice_for_any_number_of_tracks_over_time() -> None:
-    ids = ObjectIds()
-    for start in range(0, 10_000, 100):
-        numbers, _ = ids.assign(range(start, start + 255))
-        assert len(set(numbers.tolist())) == 255

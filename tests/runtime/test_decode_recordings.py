@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from can_recordings import detections_of, feed_all, messages_of, rav4_array, srr520_objects
-from eqrt.runtime.can_io import Decoder
+from eqrt.runtime.can_io import Decoder, Event
 from eqrt.runtime.detections import Detections, EgoMotion, ObjectClass, VelocityKind
 from eqrt.runtime.profile import load_profile
 from tiny_sensor import profile_of
@@ -21,10 +22,43 @@ TO_CENTER_M = 2.7  # the dataset's forward distances are from the middle of the 
 COARSE_M = 0.04  # and without the two lowest bits, which its DBC did not know
 
 
-def test_ars408_has_5609_objects_in_2001_cycles() -> None:
-    decoder = Decoder(load_profile("ars408"))
-    cycles = detections_of(feed_all(decoder, messages_of("ars408")))
-    counters = decoder.counters
+@dataclass(frozen=True)
+class Decoded:
+    """A recording, through the decoder."""
+
+    decoder: Decoder
+    events: list[Event]
+
+    @property
+    def cycles(self) -> list[Detections]:
+        return detections_of(self.events)
+
+    @property
+    def motions(self) -> list[EgoMotion]:
+        return [event for event in self.events if isinstance(event, EgoMotion)]
+
+
+def decoded(recording: str, decoder: Decoder) -> Decoded:
+    return Decoded(decoder, feed_all(decoder, messages_of(recording)))
+
+
+@pytest.fixture(scope="module")
+def ars408() -> Decoded:
+    return decoded("ars408", Decoder(load_profile("ars408")))
+
+
+@pytest.fixture(scope="module")
+def rav4() -> Decoded:
+    return decoded("rav4", Decoder(load_profile("toyota-rav4"), RAV4_BUSES))
+
+
+@pytest.fixture(scope="module")
+def srr520() -> Decoded:
+    return decoded("srr520", Decoder(load_profile("srr520")))
+
+
+def test_ars408_has_5609_objects_in_2001_cycles(ars408: Decoded) -> None:
+    cycles, counters = ars408.cycles, ars408.decoder.counters
     assert len(cycles) == counters.cycles == 2001
     assert sum(len(cycle.object_id) for cycle in cycles) == counters.objects == 5609
     assert all(cycle.complete for cycle in cycles)
@@ -32,10 +66,9 @@ def test_ars408_has_5609_objects_in_2001_cycles() -> None:
     assert (counters.incomplete_cycles, counters.invalid_objects, counters.bad_counter) == (0, 0, 0)
 
 
-def test_the_first_ars408_object_is_as_calculated_by_hand() -> None:
+def test_the_first_ars408_object_is_as_calculated_by_hand(ars408: Decoded) -> None:
     """60B#5F5F2BCC80200193: 0x5F2B >> 3 is 3045, times 0.2, less 500, is 109 m; and so on."""
-    cycles = detections_of(feed_all(Decoder(load_profile("ars408")), messages_of("ars408")[:8]))
-    (first,) = cycles
+    first = ars408.cycles[0]
     assert first.object_id.tolist() == [0x5F]
     np.testing.assert_allclose(first.position, [[109.0, -10.2]], atol=1e-9)
     np.testing.assert_allclose(first.velocity, [[0.0, 0.0]], atol=1e-9)
@@ -47,19 +80,18 @@ def test_the_first_ars408_object_is_as_calculated_by_hand() -> None:
     assert (first.timestamp_s, first.received_s) == (1591372012.436348, 1591372012.438365)
 
 
-def test_an_ars408_cycle_is_closed_by_its_last_message() -> None:
+def test_an_ars408_cycle_is_closed_by_its_last_message(ars408: Decoded) -> None:
     """Within 9 ms of its header, although the next header comes 70 ms later."""
-    cycles = detections_of(feed_all(Decoder(load_profile("ars408")), messages_of("ars408")))
+    cycles = ars408.cycles
     assert max(cycle.received_s - cycle.timestamp_s for cycle in cycles) < 0.009
     assert min(np.diff([cycle.timestamp_s for cycle in cycles])) > 0.065
 
 
-def test_rav4_radar_points_are_those_of_the_dataset() -> None:
+def test_rav4_radar_points_are_those_of_the_dataset(rav4: Decoded) -> None:
     """All 10,100: place, relative speed along the line of sight, slot, new-track flag."""
-    decoder = Decoder(load_profile("toyota-rav4"), RAV4_BUSES)
-    cycles = detections_of(feed_all(decoder, messages_of("rav4")))
+    cycles = rav4.cycles
     assert len(cycles) == 1200
-    assert decoder.counters.objects == 10_100 == len(rav4_array("radar_value"))
+    assert rav4.decoder.counters.objects == 10_100 == len(rav4_array("radar_value"))
     assert all(cycle.complete for cycle in cycles)
     np.testing.assert_allclose(points_of(cycles), dataset_points(), atol=1e-9)
 
@@ -84,29 +116,25 @@ def dataset_points() -> Float64:
     return value[np.lexsort((time_s, value[:, 5]))][:, [0, 1, 2, 5, 6]]
 
 
-def test_rav4_messages_are_whole() -> None:
+def test_rav4_messages_are_whole(rav4: Decoded) -> None:
     """Not one of 24,174 checksums fails, and no cycle of the radar is missing."""
-    decoder = Decoder(load_profile("toyota-rav4"), RAV4_BUSES)
-    feed_all(decoder, messages_of("rav4"))
-    counters = decoder.counters
+    counters = rav4.decoder.counters
     assert counters.used == 1200 * 16 + 2 * 4974 + 66
     assert counters.messages == counters.used + counters.other_id == 98_800
     assert (counters.bad_checksum, counters.bad_counter) == (0, 0)
     assert (counters.stray, counters.short) == (0, 0)
 
 
-def test_rav4_speed_is_that_of_the_dataset() -> None:
-    events = feed_all(Decoder(load_profile("toyota-rav4"), RAV4_BUSES), messages_of("rav4"))
-    speeds = [e for e in events if isinstance(e, EgoMotion) and e.speed_mps is not None]
+def test_rav4_speed_is_that_of_the_dataset(rav4: Decoded) -> None:
+    speeds = [motion for motion in rav4.motions if motion.speed_mps is not None]
     decoded = np.array([(e.timestamp_s, e.speed_mps) for e in speeds], np.float64)
     np.testing.assert_allclose(decoded[:, 0], rav4_array("speed_t"), atol=1e-6)
     np.testing.assert_allclose(decoded[:, 1], rav4_array("speed_value")[:, 0], atol=1e-12)
 
 
-def test_rav4_yaw_rate_is_positive_to_the_left() -> None:
+def test_rav4_yaw_rate_is_positive_to_the_left(rav4: Decoded) -> None:
     """It follows the change of the GNSS course, counter-clockwise seen from above."""
-    events = feed_all(Decoder(load_profile("toyota-rav4"), RAV4_BUSES), messages_of("rav4"))
-    turns = [e for e in events if isinstance(e, EgoMotion) and e.yaw_rate_rad_s is not None]
+    turns = [motion for motion in rav4.motions if motion.yaw_rate_rad_s is not None]
     times_s, up = rav4_array("frame_times"), rav4_array("frame_positions")[0]
     velocity = rav4_array("frame_velocities")
     before, after = velocity[:-20], velocity[20:]  # one second apart
@@ -161,10 +189,8 @@ def test_rav4_tracks_with_their_second_messages_are_the_same_points(tmp_path: Pa
     assert decoder.counters.bad_counter == 0
 
 
-def test_srr520_has_the_40_objects_of_its_publisher() -> None:
-    decoder = Decoder(load_profile("srr520"))
-    events = feed_all(decoder, messages_of("srr520"))
-    (cycle,) = detections_of(events)
+def test_srr520_has_the_40_objects_of_its_publisher(srr520: Decoded) -> None:
+    (cycle,) = srr520.cycles
     truth = {key: [item[key] for item in srr520_objects()] for key in srr520_objects()[0]}
     assert cycle.complete
     assert cycle.object_id.tolist() == truth["object_id"]
@@ -181,8 +207,7 @@ def test_srr520_has_the_40_objects_of_its_publisher() -> None:
     assert cycle.is_new.tolist() == [life <= 1 for life in truth["life_cycles"]]
 
 
-def test_srr520_repeats_the_ego_motion_it_was_given() -> None:
-    events = feed_all(Decoder(load_profile("srr520")), messages_of("srr520"))
-    (motion,) = [event for event in events if isinstance(event, EgoMotion)]
+def test_srr520_repeats_the_ego_motion_it_was_given(srr520: Decoded) -> None:
+    (motion,) = srr520.motions
     assert motion.speed_mps == pytest.approx(6.78121, abs=1e-4)
     assert motion.yaw_rate_rad_s == pytest.approx(-0.0063293, abs=1e-6)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import pytest
 
 from eqrt.core.errors import ProfileError
+from eqrt.runtime import profile, profile_schema
 from eqrt.runtime.profile import builtin_profiles, load_profile
 from tiny_sensor import COUNTED, DBC, SENSOR, SLOTS, profile_of
 
 
 @pytest.mark.parametrize("name", builtin_profiles())
 def test_a_built_in_profile_loads_by_its_name(name: str) -> None:
-    profile = load_profile(name)
-    assert profile.name == name
-    assert profile.description
-    assert profile.sensors or profile.ego
+    loaded = load_profile(name)
+    assert loaded.name == name
+    assert loaded.description
+    assert loaded.sensors or loaded.ego
 
 
 def test_the_sensors_we_promise_are_built_in() -> None:
@@ -33,10 +36,10 @@ def test_two_sources_of_latitude_and_longitude_are_refused(tmp_path: Path) -> No
 
 
 def test_a_profile_is_loaded_from_a_path(tmp_path: Path) -> None:
-    profile = profile_of(tmp_path, SLOTS)
-    assert profile.name == "tiny"
-    assert profile.sensor("tiny").slots == (0, 1, 2, 3)
-    assert not profile.has_ego
+    loaded = profile_of(tmp_path, SLOTS)
+    assert loaded.name == "tiny"
+    assert loaded.sensor("tiny").slots == (0, 1, 2, 3)
+    assert not loaded.has_ego
 
 
 def test_roles_are_the_buses_that_the_profile_speaks_of() -> None:
@@ -101,7 +104,7 @@ def test_id_offsets_move_sensor_and_ego(tmp_path: Path) -> None:
         (
             "first.X",
             "third.X",
-            "fields.x: there is no message 'third' in the sensor; there is first",
+            "fields.x: there is no message 'third' here; there is first, second",
         ),
         ("first.X", "X", "fields.x: say which message 'X' is in, for example 'first.X'"),
         ("first.X", "first.ID", "fields.x: the DBC gives first.ID no unit; add unit = one of 'm'"),
@@ -218,3 +221,32 @@ def test_a_sensor_template_names_its_slots(tmp_path: Path) -> None:
     text += 'fields = { x = "one.X", y = "one.Y" }\n'
     with pytest.raises(ProfileError, match="the message FIRST_01 is named more than once"):
         profile_of(tmp_path, text)
+
+
+DOCS = Path(__file__).parents[2] / "docs" / "profiles.md"
+
+
+def test_the_page_about_profiles_has_every_key() -> None:
+    text = DOCS.read_text()
+    tables = [
+        kind
+        for kind in vars(profile_schema).values()
+        if isinstance(kind, type) and is_dataclass(kind)
+    ]
+    keys = {field.metadata.get("key", field.name) for kind in tables for field in fields(kind)}
+    shown = set(re.findall(r"\w+", text))
+    assert sorted(keys - shown) == []
+
+
+def test_the_page_about_profiles_shows_profiles_that_load(tmp_path: Path) -> None:
+    """The ARS408's and the generic one, which is the built-in one to the letter."""
+    blocks = re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    ars408, generic = (block for block in blocks if block.startswith("description"))
+    assert profile_of(tmp_path, ars408).sensors[0].framing == "counted"
+    built_in = Path(profile.__file__).parent / "profiles" / "generic.toml"
+    assert built_in.read_text().endswith(generic)
+
+
+def test_the_page_about_profiles_lists_the_built_in_ones() -> None:
+    listed = re.findall(r"^\| `([a-z0-9-]+)` \|", DOCS.read_text(), re.MULTILINE)
+    assert set(builtin_profiles()) <= set(listed)

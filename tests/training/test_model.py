@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from eqrt.export.vectors import (
 from eqrt.training.canonical import canonical_from_tile
 from eqrt.training.losses import best_mode_loss
 from eqrt.training.model import EquivariantPredictor, ModelConfig
+from poses import random_pose
 
 CONFIG = ModelConfig(
     num_agents=6,
@@ -68,16 +70,17 @@ def predict(model: EquivariantPredictor, scene: Scene) -> tuple[np.ndarray, np.n
 def in_double(scene: Scene) -> Scene:
     """Turning in float64, so that nothing but the network can break the symmetry."""
     names = ("history", "heading", "centerlines")
-    return replace(scene, **{name: getattr(scene, name).astype(np.float64) for name in names})
+    changes: dict[str, Any] = {name: getattr(scene, name).astype(np.float64) for name in names}
+    return replace(scene, **changes)
 
 
 def move_exactly(scene: Scene, pose: Pose2) -> Scene:
-    return replace(
-        scene,
-        history=pose.apply(scene.history),
-        heading=pose.rotate(scene.heading),
-        centerlines=pose.apply(scene.centerlines),
-    )
+    changes: dict[str, Any] = {
+        "history": pose.apply(np.asarray(scene.history, np.float64)),
+        "heading": pose.rotate(np.asarray(scene.heading, np.float64)),
+        "centerlines": pose.apply(np.asarray(scene.centerlines, np.float64)),
+    }
+    return replace(scene, **changes)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -88,7 +91,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_prediction(
     scene = in_double(nan_free(SCENES[name]))
     before, probabilities = predict(model, scene)
     for _ in range(10):
-        pose = Pose2(*rng.uniform(-900, 900, 2), rng.uniform(-np.pi, np.pi))
+        pose = random_pose(rng, 900.0)
         after, same = predict(model, move_exactly(scene, pose))
         np.testing.assert_allclose(after, pose.apply(before), atol=1e-8)
         np.testing.assert_allclose(same, probabilities, atol=1e-10)
@@ -187,7 +190,9 @@ def test_gradients_are_finite_whatever_is_masked(steps: int) -> None:
         inputs = [torch.from_numpy(value) for value in seen_for(scene, steps).inputs().values()]
         future = torch.zeros(1, CONFIG.horizon_steps, 2)
         seen = torch.ones(1, CONFIG.horizon_steps, dtype=torch.bool)
-        best_mode_loss(*model(*inputs), future, seen).backward()
+        trajectories, probabilities = model(*inputs)
+        loss = best_mode_loss(trajectories, probabilities, future, seen)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         gradients: list[Tensor] = [p.grad for p in model.parameters() if p.grad is not None]
         assert gradients
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
@@ -228,5 +233,6 @@ def test_a_slowly_stopping_target_is_predicted_without_a_jump(model: Equivariant
     speeds = np.linspace(2.0, 0.0, 101)
     moved = np.linalg.norm(np.diff(ends(speeds), axis=0), axis=-1)
     at = int(moved.argmax())
-    finer = np.linalg.norm(np.diff(ends(np.linspace(*speeds[at : at + 2], 11)), axis=0), axis=-1)
+    between = np.linspace(speeds[at], speeds[at + 1], 11)
+    finer = np.linalg.norm(np.diff(ends(between), axis=0), axis=-1)
     assert finer.max() < 0.3 * moved[at]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.checksums import Checksum, crc8, sum8, xor8
-from eqrt.runtime.dbc_tables import DbcMessage
+from eqrt.runtime.dbc_files import DbcMessage
 from eqrt.runtime.profile_schema import ChecksumTable
 
 _MAX_STANDARD_ID, _MAX_EXTENDED_ID = 0x7FF, 0x1FFFFFFF

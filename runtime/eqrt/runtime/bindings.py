@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.conditions import ConditionError, Evaluate, parse_condition
-from eqrt.runtime.dbc_tables import Column, DbcMessage, Signal
+from eqrt.runtime.dbc_files import DbcMessage
+from eqrt.runtime.dbc_tables import Column, Signal
 from eqrt.runtime.profile_schema import FieldTable, MeanTable, SpanTable
 from eqrt.runtime.units import FACTORS
 
@@ -94,10 +95,6 @@ class Binder:
         """The columns of a part: row after row, for every object in the message."""
         return [column for row in self._rows[part].values() for column in row]
 
-    def num_rows(self, part: int) -> int:
-        """S, columns of the part for one object."""
-        return len(self._rows[part])
-
     def field(self, key: str, entry: str | FieldTable | MeanTable, measure: str) -> BoundField:
         """A field in SI units; `measure` says what it must measure."""
         if isinstance(entry, str):
@@ -154,7 +151,7 @@ class Binder:
             return 0, name
         if part not in self._names:
             known = ", ".join(self._names)
-            raise self.error(key, f"there is no message {part!r} in the sensor; there is {known}")
+            raise self.error(key, f"there is no message {part!r} here; there is {known}")
         return self._names.index(part), signal
 
     def _signal(self, key: str, part: int, name: str, number: int) -> Signal:

@@ -28,7 +28,7 @@ from eqrt.runtime.forecasts import ForecastSet
 from eqrt.runtime.picture import render
 from eqrt.runtime.score import Scoreboard
 from eqrt.runtime.snapshots import BestMoment
-from eqrt.runtime.tiles import Tile, load_tile
+from eqrt.runtime.tiles import load_tile
 
 DATA = Path(__file__).parent / "demo_data"
 _START_S = 20.0  # a service that has not said that it runs by then never will

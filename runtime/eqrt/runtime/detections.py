@@ -40,7 +40,7 @@ class VelocityKind(IntEnum):
     ABSOLUTE = 2
     """Over ground, in the sensor's axes."""
     RADIAL = 3
-    """Only the component along the line of sight is known (relative); given as a vector along it."""
+    """Only the part along the line of sight is known (relative), given as a vector along it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.addresses import Address, address_of
 from eqrt.runtime.bindings import Binder, BoundCondition, BoundField
-from eqrt.runtime.dbc_tables import Column, Dbc, DbcMessage, SignalTable
+from eqrt.runtime.dbc_files import Dbc, DbcMessage
+from eqrt.runtime.dbc_tables import Column, SignalTable
 from eqrt.runtime.profile_schema import EgoMessageTable, EgoTable
 from eqrt.runtime.sensor_checks import MAX_TIME_S
 

@@ -6,8 +6,7 @@ Every message is classic CAN of eight bytes, all signals little-endian.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eqrt.core.frames import Pose2
-from eqrt.runtime.dbc_tables import DbcMessage, Signal, load_dbc
+from eqrt.runtime.dbc_files import DbcMessage, load_dbc
+from eqrt.runtime.dbc_tables import Signal
 from eqrt.runtime.detections import Detections, VelocityKind
 
 INTERFACE_VERSION = 1
@@ -79,30 +79,6 @@ def encode_cycle(
         for name, block in blocks
         for data in block
     ]
-
-
-class ObjectIds:
-    """Numbers of 0 to 255 for tracks of any number, as a sensor gives them.
-
-    A track keeps its number while it is seen in every cycle; a number that has become free is given
-    away again as late as possible.
-    """
-
-    def __init__(self) -> None:
-        self._free = deque(range(MAX_OBJECT_ID + 1))
-        self._given: dict[int, int] = {}
-
-    def assign(self, track_ids: Iterable[int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """(object ids, is new) of the tracks in this cycle; at most 255."""
-        tracks = list(track_ids)
-        for gone in [track for track in self._given if track not in set(tracks)]:
-            self._free.append(self._given.pop(gone))
-        is_new = [track not in self._given for track in tracks]
-        for track in tracks:
-            if track not in self._given:
-                self._given[track] = self._free.popleft()
-        ids = [self._given[track] for track in tracks]
-        return np.array(ids, np.int64), np.array(is_new, np.bool_)
 
 
 def _object_blocks(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
 from eqrt.core.scene import AgentHistories, Scene, build_scene, concatenate, tile_origin
-from eqrt.runtime.can_io import Decoder
+from eqrt.runtime.can_io import Decoder, Event
 from eqrt.runtime.detections import Detections, EgoMotion, EgoPose
 from eqrt.runtime.ego import EgoState, EgoTracker
 from eqrt.runtime.forecasts import ForecastSet, Mode
@@ -102,14 +102,14 @@ class Pipeline:
         events = self.decoder.feed(message, timestamp_s)
         if not events:
             return _NOTHING
-        return [made for event in events if (made := self._handle(event, timestamp_s)) is not None]
+        return self._handle_all(events, timestamp_s)
 
     def poll(self, now_s: float) -> list[ForecastSet]:
         """Close cycles whose rest does not come, and say so when nothing comes any more."""
         if now_s < self._control_due_s:
             return _NOTHING
         self._control_due_s = now_s + _CONTROL_S
-        made = [f for e in self.decoder.poll(now_s) if (f := self._handle(e, now_s)) is not None]
+        made = self._handle_all(self.decoder.poll(now_s), now_s)
         if now_s >= self._silent_due_s and not made:
             self._silent_due_s += self._predictor.contract.dt_s
             made.append(self._silence(now_s))
@@ -117,9 +117,12 @@ class Pipeline:
 
     def finish(self, now_s: float) -> list[ForecastSet]:
         """Nothing more will come: close the cycles that are open."""
-        return self.poll(max(now_s, self._control_due_s) + _FINISH_S)
+        return self._handle_all(self.decoder.poll(now_s + _FINISH_S), now_s)
 
-    def _handle(self, event: Detections | EgoMotion | EgoPose, now_s: float) -> ForecastSet | None:
+    def _handle_all(self, events: list[Event], now_s: float) -> list[ForecastSet]:
+        return [made for event in events if (made := self._handle(event, now_s)) is not None]
+
+    def _handle(self, event: Event, now_s: float) -> ForecastSet | None:
         if isinstance(event, EgoMotion):
             self.ego.motion(event)
             return None

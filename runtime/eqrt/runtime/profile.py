@@ -12,10 +12,11 @@ from functools import cache
 from pathlib import Path
 
 from eqrt.core.errors import ProfileError
-from eqrt.runtime.dbc_tables import Dbc, load_dbc
+from eqrt.runtime.dbc_files import Dbc, load_dbc
 from eqrt.runtime.ego_profile import EgoProfile, bind_ego
 from eqrt.runtime.profile_schema import ProfileTable
-from eqrt.runtime.sensor_profile import SensorProfile, bind_sensor
+from eqrt.runtime.sensor_binding import bind_sensor
+from eqrt.runtime.sensor_profile import SensorProfile
 from eqrt.runtime.toml_tables import read_toml
 
 _HERE = Path(__file__).parent

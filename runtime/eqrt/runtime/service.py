@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from eqrt.runtime.pipeline import Pipeline
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly
 _REPORT_S = 1.0
-_MAX_QUEUED_S = 1.0  # a kernel stamp older than this was made before the wall clock was set
+MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but a wall clock that was set
 
 
 class Receiver(Protocol):
@@ -67,6 +68,7 @@ class Service:
         self._receiver = receiver
         self._publishers = publishers
         self._report = report
+        self._clock = ArrivalClock()
         self._second = Report()
         self.messages = 0
         """Received so far."""
@@ -76,14 +78,14 @@ class Service:
         report_due_s = time.monotonic() + _REPORT_S
         while not should_stop():
             message = self._receiver.recv(_NAP_S)
-            now_s = time.monotonic()
+            stamp_s = None if message is None else message.timestamp
+            now_s = self._clock.now_s(time.monotonic(), stamp_s, time.time())
+            self._publish(self._pipeline.poll(now_s), now_s)
             if message is not None:
                 self._second.messages += 1
-                arrived_s = arrival_s(message.timestamp, now_s, time.time())
-                self._publish(self._pipeline.feed(message, arrived_s), arrived_s)
-            self._publish(self._pipeline.poll(now_s), now_s)
-            if now_s >= report_due_s:
-                report_due_s = self._say(now_s, report_due_s)
+                self._publish(self._pipeline.feed(message, now_s), now_s)
+            if (monotonic_s := time.monotonic()) >= report_due_s:
+                report_due_s = self._say(monotonic_s, report_due_s)
 
     def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
         for forecast in forecasts:
@@ -101,12 +103,22 @@ class Service:
         return max(due_s + _REPORT_S, now_s)
 
 
-def arrival_s(stamp_s: float, now_s: float, wall_s: float) -> float:
-    """When a message arrived, on the monotonic clock.
+class ArrivalClock:
+    """The pipeline's time while serving: when things arrived, on the monotonic clock.
 
-    The driver's stamp (wall clock, `stamp_s`) tells how long the message has been waiting in the
-    queue. A stamp from the future or from long ago tells that the wall clock was set, and nothing
-    else: then the message arrived now.
+    Messages wait in the driver's queue while the service is busy. Their stamps (wall clock) tell
+    how long, and the pipeline's time follows them, so that a queue full of messages does not look
+    like a bus that has fallen silent. A stamp that is not from the last seconds says that the wall
+    clock was set, and nothing else. The time told never goes back.
     """
-    waited_s = wall_s - stamp_s
-    return now_s - waited_s if 0.0 <= waited_s <= _MAX_QUEUED_S else now_s
+
+    def __init__(self) -> None:
+        self._told_s = -math.inf
+
+    def now_s(self, monotonic_s: float, stamp_s: float | None, wall_s: float) -> float:
+        """When the message stamped `stamp_s` arrived; None = the queue is empty, and it is now."""
+        waited_s = 0.0 if stamp_s is None else wall_s - stamp_s
+        if not 0.0 <= waited_s <= MAX_QUEUED_S:
+            waited_s = 0.0
+        self._told_s = max(self._told_s, monotonic_s - waited_s)
+        return self._told_s

@@ -27,13 +27,14 @@ class BestMoment:
         self._motion_m = 0.0
 
     def add(self, forecast: ForecastSet, scored: list[Scored]) -> None:
-        """Take one cycle, and what it made scorable (predictions of one earlier cycle)."""
+        """Take one cycle, and what it made scorable: predictions of an earlier cycle or two."""
         self._recent.append(forecast)
+        newest_s = max((s.anchor_s for s in scored), default=0.0)
+        scored = [s for s in scored if s.anchor_s > newest_s - forecast.dt_s / 2]
         motion_m = sum(float(np.linalg.norm(s.truth[-1] - s.truth[0])) for s in scored)
         if motion_m <= self._motion_m:
             return
-        anchor_s = max(s.anchor_s for s in scored)
-        then = min(self._recent, key=lambda f: abs(f.timestamp_s - anchor_s))
+        then = min(self._recent, key=lambda f: abs(f.timestamp_s - newest_s))
         self._motion_m = motion_m
         self._best = (then, scored, self._histories(then, {s.track_id for s in scored}))
 

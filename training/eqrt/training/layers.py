@@ -136,6 +136,7 @@ class FeatureLearning(nn.Module):
         self.distance = nn.Linear(channels + RELATIONS, width * categories, bias=False)
         self.pull = nn.Linear(width, channels)
         self.nonlinearity = VectorNonlinearity(channels)
+        self.step = nn.Parameter(torch.full((channels,), 0.1))  # or vectors grow with every layer
         self.update = mlp([2 * width + 2 * channels, width, width])
         self.norm = nn.LayerNorm(width)
 
@@ -149,7 +150,7 @@ class FeatureLearning(nn.Module):
         pull = (self.pull(message) * pair_valid).unsqueeze(-2)  # (B, N, N, 1, C) does not turn
         aggregated = (pull * offset).sum(2) / count.unsqueeze(-2)  # (B, N, 2, C)
         scale = 1.0 + self.inner(pattern).unsqueeze(-2)  # (B, N, 1, C)
-        geometric = geometric + self.nonlinearity(scale * geometric + aggregated)
+        geometric = geometric + self.step * self.nonlinearity(scale * geometric + aggregated)
         seen = self.update(self._invariants(geometric, pattern, message.sum(2) / count))
         return geometric, self.norm(pattern + seen)
 

@@ -298,7 +298,7 @@ class Decoder(nn.Module):
         probabilities = self.logits(pattern).softmax(-1)
         if self.modes == 1:
             return trajectories, probabilities
-        probabilities, order = probabilities.sort(dim=-1, descending=True, stable=True)
+        probabilities, order = probabilities.topk(self.modes, dim=-1)
         order = order[..., None, None].expand(-1, -1, self.steps, 2)
         return trajectories.gather(1, order), probabilities
 

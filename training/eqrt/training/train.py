@@ -34,8 +34,6 @@ class DataConfig:
 
     held_out: list[str]
     """Scenario names (without .xml) that are evaluated on and never trained on."""
-    left_out: list[str]
-    """Scenarios used for neither: they share vehicles with the held-out ones."""
     stride: int
     """Steps between training windows."""
     credits: str
@@ -119,9 +117,8 @@ def load_data(config: TrainConfig, folder: Path) -> tuple[Windows, Windows]:
     missing = sorted(set(config.data.held_out) - set(files))
     if missing:
         raise EqrtError(f"{folder}: held-out scenario {missing[0]} is not here")
-    apart = {*config.data.held_out, *config.data.left_out}
     contract = config.model.contract(config.name, "0.0.0")
-    train_files = [path for name, path in files.items() if name not in apart]
+    train_files = [path for name, path in files.items() if name not in config.data.held_out]
     if not train_files:
         raise EqrtError(f"{folder}: every scenario here is held out; nothing to train on")
     held_files = [files[name] for name in config.data.held_out]

@@ -1,0 +1,291 @@
+"""The shipped file and freshly exported ones: clean, equivariant, refused when damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnx.numpy_helper
+import pytest
+import torch
+
+from eqrt.core.contract import METADATA_KEY, ModelContract
+from eqrt.core.errors import ContractError, EqrtError
+from eqrt.core.scene import Scene, concatenate
+from eqrt.export.artifact import write_artifact
+from eqrt.export.to_onnx import FORBIDDEN_OPS, IR_VERSION, OPSET, to_onnx
+from eqrt.export.vectors import move, named_scenes, nan_where_invalid
+from eqrt.runtime.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.training.checkpoint import Card, load_checkpoint, save_checkpoint
+from eqrt.training.model import EquivariantPredictor, ModelConfig
+from poses import random_pose
+
+CONFIG = ModelConfig(
+    num_agents=4,
+    history_steps=20,
+    num_centerlines=4,
+    centerline_points=10,
+    horizon_steps=30,
+    num_modes=3,
+    dt_s=0.1,
+    layers=2,
+    channels=8,
+    width=16,
+    categories=2,
+    token_width=8,
+    heads=2,
+    pointers=2,
+)
+CARD = Card(name="test", data="made up", license="Apache-2.0", metrics={"ade_3s": 1.0})
+
+
+@pytest.fixture(scope="module")
+def model() -> EquivariantPredictor:
+    """Three modes, and random weights also where training starts from zero."""
+    torch.manual_seed(5)
+    model = EquivariantPredictor(CONFIG).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return model
+
+
+@pytest.fixture(scope="module")
+def artifact(model: EquivariantPredictor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export") / "artifact"
+    assert write_artifact(model, CONFIG.contract("test", "1.2.3"), CARD, folder) < 1e-3
+    return folder
+
+
+@pytest.fixture
+def copy(artifact: Path, tmp_path: Path) -> Path:
+    """An artifact that may be damaged."""
+    return Path(shutil.copytree(artifact, tmp_path / "copy"))
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Predictor:
+    return Predictor.load(DEFAULT_ARTIFACT)
+
+
+SHIPPED_SCENES = named_scenes(Predictor.load(DEFAULT_ARTIFACT).contract)
+
+
+def nan_free(scene: Scene) -> Scene:
+    return replace(
+        scene, history=np.nan_to_num(scene.history), centerlines=np.nan_to_num(scene.centerlines)
+    )
+
+
+@pytest.mark.parametrize("name", SHIPPED_SCENES)
+def test_the_shipped_file_is_equivariant_within_a_millimetre(shipped: Predictor, name: str) -> None:
+    """float32, anywhere within the kilometre of a tile, at any rotation."""
+    rng = np.random.default_rng(11)
+    scene = nan_free(SHIPPED_SCENES[name])
+    before = shipped.predict(scene)
+    for _ in range(50):
+        pose = random_pose(rng, 250.0)
+        after = shipped.predict(move(scene, pose))
+        np.testing.assert_allclose(after.trajectories, pose.apply(before.trajectories), atol=1e-3)
+        np.testing.assert_allclose(after.probabilities, before.probabilities, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SHIPPED_SCENES)
+def test_values_under_false_masks_change_no_bit_of_the_output(
+    shipped: Predictor, name: str
+) -> None:
+    clean = shipped.predict(nan_free(SHIPPED_SCENES[name]))
+    dirty = shipped.predict(nan_where_invalid(SHIPPED_SCENES[name]))
+    np.testing.assert_array_equal(dirty.trajectories, clean.trajectories)
+
+
+def test_one_poisoned_target_leaves_the_rest_of_the_batch_alone(shipped: Predictor) -> None:
+    scene = SHIPPED_SCENES["driving"]
+    poison = replace(scene, history=np.full_like(scene.history, np.inf))
+    alone = shipped.predict(scene)
+    together = shipped.predict(concatenate([poison, scene, poison]))
+    np.testing.assert_allclose(together.trajectories[1:2], alone.trajectories, atol=1e-4)
+
+
+def test_a_batch_is_its_targets_one_by_one(shipped: Predictor) -> None:
+    scenes = [nan_free(scene) for scene in SHIPPED_SCENES.values()]
+    together = shipped.predict(concatenate(scenes))
+    for row, scene in enumerate(scenes):
+        alone = shipped.predict(scene)
+        np.testing.assert_allclose(together.trajectories[row], alone.trajectories[0], atol=1e-3)
+
+
+def test_the_file_is_what_old_and_small_runtimes_load(artifact: Path) -> None:
+    proto = onnx.load(artifact / "model.onnx")
+    assert proto.ir_version == IR_VERSION
+    assert {opset.domain: opset.version for opset in proto.opset_import} == {"": OPSET}
+    assert not {node.op_type for node in proto.graph.node} & FORBIDDEN_OPS
+    assert not any(tensor.external_data for tensor in proto.graph.initializer)
+
+
+@pytest.mark.parametrize("folder", [DEFAULT_ARTIFACT, None], ids=["shipped", "exported"])
+def test_nothing_of_the_exporting_machine_is_in_the_file(
+    folder: Path | None, artifact: Path
+) -> None:
+    content = ((folder or artifact) / "model.onnx").read_bytes()
+    for trace in (b"/root", b"/home", b"site-packages", b".py", b"torch", b"Traceback"):
+        assert trace not in content
+
+
+def test_the_contract_is_in_the_file_and_beside_it(artifact: Path) -> None:
+    proto = onnx.load(artifact / "model.onnx")
+    inside = {entry.key: entry.value for entry in proto.metadata_props}
+    beside = (artifact / "contract.json").read_text(encoding="utf-8")
+    assert json.loads(inside[METADATA_KEY]) == json.loads(beside)
+    contract = ModelContract.from_json(beside, "contract.json")
+    assert contract == CONFIG.contract("test", "1.2.3")
+    assert inside["license"] == "Apache-2.0"
+
+
+def test_the_same_network_exports_to_the_same_bytes(model: EquivariantPredictor) -> None:
+    contract = CONFIG.contract("test", "1.2.3")
+    assert to_onnx(model, contract, {}) == to_onnx(model, contract, {})
+
+
+def test_sha256sum_itself_accepts_the_checksums(artifact: Path) -> None:
+    subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=artifact, check=True)
+
+
+def test_test_vectors_are_what_the_reference_evaluator_computes(artifact: Path) -> None:
+    """ONNX's own evaluator, which shares no code with onnxruntime."""
+    from onnx.reference import ReferenceEvaluator
+
+    evaluator = ReferenceEvaluator(onnx.load(artifact / "model.onnx"))
+    for folder in sorted(artifact.glob("test_data_set_*")):
+        names = list(CONFIG.contract("test", "1.2.3").inputs)
+        found = evaluator.run(None, dict(zip(names, stored(folder, "input", 5), strict=True)))
+        trajectories, probabilities = stored(folder, "output", 2)
+        np.testing.assert_allclose(found[0], trajectories, atol=1e-3)
+        np.testing.assert_allclose(found[1], probabilities, atol=1e-5)
+
+
+def stored(vector: Path, side: str, count: int) -> list[np.ndarray]:
+    paths = [vector / f"{side}_{index}.pb" for index in range(count)]
+    return [onnx.numpy_helper.to_array(onnx.load_tensor(path)) for path in paths]
+
+
+def flip_a_bit(folder: Path) -> None:
+    content = bytearray((folder / "model.onnx").read_bytes())
+    content[len(content) // 2] ^= 4
+    (folder / "model.onnx").write_bytes(content)
+
+
+def cut_it_short(folder: Path) -> None:
+    content = (folder / "model.onnx").read_bytes()
+    (folder / "model.onnx").write_bytes(content[: len(content) // 2])
+
+
+def remove_the_checksums(folder: Path) -> None:
+    (folder / "SHA256SUMS").unlink()
+
+
+def remove_the_model(folder: Path) -> None:
+    (folder / "model.onnx").unlink()
+
+
+def remove_the_vectors(folder: Path) -> None:
+    for vector in folder.glob("test_data_set_*"):
+        shutil.rmtree(vector)
+
+
+def change_a_vector(folder: Path) -> None:
+    path = folder / "test_data_set_0" / "output_0.pb"
+    tensor = onnx.load_tensor(path)
+    values = onnx.numpy_helper.to_array(tensor) + np.float32(0.01)
+    path.write_bytes(onnx.numpy_helper.from_array(values, tensor.name).SerializeToString())
+
+
+def sign(folder: Path) -> None:
+    digest = hashlib.sha256((folder / "model.onnx").read_bytes()).hexdigest()
+    (folder / "SHA256SUMS").write_text(f"{digest}  model.onnx\n", encoding="utf-8")
+
+
+def put_something_else_there(folder: Path) -> None:
+    (folder / "model.onnx").write_bytes(b"not a model at all")
+    sign(folder)
+
+
+def take_the_contract_out(folder: Path) -> None:
+    proto = onnx.load(folder / "model.onnx")
+    del proto.metadata_props[:]
+    onnx.save(proto, folder / "model.onnx")
+    sign(folder)
+
+
+def speak_another_schema(folder: Path) -> None:
+    proto = onnx.load(folder / "model.onnx")
+    entry = next(e for e in proto.metadata_props if e.key == METADATA_KEY)
+    entry.value = entry.value.replace('"schema": 1', '"schema": 2')
+    onnx.save(proto, folder / "model.onnx")
+    sign(folder)
+
+
+def promise_other_sizes(folder: Path) -> None:
+    proto = onnx.load(folder / "model.onnx")
+    entry = next(e for e in proto.metadata_props if e.key == METADATA_KEY)
+    entry.value = entry.value.replace('"num_agents": 4', '"num_agents": 5')
+    onnx.save(proto, folder / "model.onnx")
+    sign(folder)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (flip_a_bit, "is damaged"),
+        (cut_it_short, "is damaged"),
+        (remove_the_checksums, "SHA256SUMS"),
+        (remove_the_model, "No such file"),
+        (remove_the_vectors, "no test_data_set"),
+        (change_a_vector, "differ by 0.01"),
+        (put_something_else_there, "cannot load it"),
+        (take_the_contract_out, "not an eqrt model"),
+        (speak_another_schema, "schema 2 is not supported"),
+        (promise_other_sizes, "'history'"),
+    ],
+)
+def test_a_damaged_artifact_is_refused_in_one_line(copy: Path, damage, said: str) -> None:  # type: ignore[no-untyped-def]
+    damage(copy)
+    with pytest.raises(ContractError) as refused:
+        Predictor.load(copy)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_failed_export_leaves_the_old_artifact_alone(
+    model: EquivariantPredictor, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = (copy / "SHA256SUMS").read_bytes()
+    monkeypatch.setattr("eqrt.export.artifact.AGREEMENT_M", -1.0)  # nothing agrees that well
+    with pytest.raises(EqrtError, match="differ"):
+        write_artifact(model, CONFIG.contract("test", "2.0.0"), CARD, copy)
+    assert (copy / "SHA256SUMS").read_bytes() == before
+    assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]
+
+
+def test_a_checkpoint_comes_back_as_it_was(model: EquivariantPredictor, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "m.safetensors", model, CARD)
+    loaded, card = load_checkpoint(tmp_path / "m.safetensors")
+    assert card == CARD
+    assert loaded.config == CONFIG
+    for name, tensor in model.state_dict().items():
+        torch.testing.assert_close(loaded.state_dict()[name], tensor, rtol=0, atol=0)
+
+
+def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(EqrtError, match="no such checkpoint"):
+        load_checkpoint(tmp_path / "missing.safetensors")
+    (tmp_path / "bad.safetensors").write_bytes(b"nothing of the kind")
+    with pytest.raises(EqrtError, match="not a checkpoint") as refused:
+        load_checkpoint(tmp_path / "bad.safetensors")
+    assert "\n" not in str(refused.value)
