@@ -12,9 +12,9 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.runtime.can_io import Decoder, Event
-from eqrt.runtime.detections import Detections
-from eqrt.runtime.logs import read_log
+from eqrt.runtime.bus.logs import read_log
+from eqrt.runtime.decoding.can_io import Decoder, Event
+from eqrt.runtime.decoding.detections import Detections
 
 DATA = Path(__file__).parent / "data" / "can"
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from eqrt.core.frames import Pose2
-from eqrt.runtime.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
 
 H, K, DT_S = 30, 2, 0.1
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
-from eqrt.runtime.can_io import Decoder
-from eqrt.runtime.detections import Detections, EgoMotion, EgoPose
-from eqrt.runtime.ego import EgoTracker
-from eqrt.runtime.logs import read_log
-from eqrt.runtime.profile import load_profile
+from eqrt.runtime.bus.logs import read_log
+from eqrt.runtime.decoding.can_io import Decoder
+from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.tracking.ego import EgoTracker
 
 DATA = Path(__file__).parent / "data" / "can" / "rav4"
 

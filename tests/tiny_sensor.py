@@ -6,8 +6,8 @@ from pathlib import Path
 
 import can
 
-from eqrt.runtime.can_io import Decoder
-from eqrt.runtime.profile import Profile, load_profile
+from eqrt.runtime.decoding.can_io import Decoder
+from eqrt.runtime.decoding.profile import Profile, load_profile
 
 LIST, FIRST, SECOND, POLAR, PACKED, EGO, GEAR = 0x100, 0x110, 0x120, 0x130, 0x140, 0x150, 0x151
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from eqrt.core.errors import EqrtError, UsageError
 
 COMMANDS = {
-    "demo": ("eqrt.runtime.demo", "see it work: recorded traffic over CAN, predicted and scored"),
+    "demo": ("eqrt.runtime.demo.command", "see it work: recorded traffic, predicted and scored"),
     "serve": ("eqrt.runtime.serve", "predict from a CAN bus, publish on CAN and as datagrams"),
     "play": ("eqrt.runtime.play", "put a recorded log on a CAN bus"),
     "replay": ("eqrt.runtime.replay", "run the service on a recorded log, offline, repeatably"),

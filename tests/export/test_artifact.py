@@ -21,7 +21,7 @@ from eqrt.core.scene import Scene, concatenate
 from eqrt.export.artifact import write_artifact
 from eqrt.export.to_onnx import FORBIDDEN_OPS, IR_VERSION, OPSET, to_onnx
 from eqrt.export.vectors import move, named_scenes, nan_where_invalid
-from eqrt.runtime.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.training.checkpoint import Card, load_checkpoint, save_checkpoint
 from eqrt.training.model import EquivariantPredictor, ModelConfig
 from poses import random_pose
@@ -164,13 +164,15 @@ def test_test_vectors_are_what_the_reference_evaluator_computes(artifact: Path) 
     evaluator = ReferenceEvaluator(onnx.load(artifact / "model.onnx"))
     for folder in sorted(artifact.glob("test_data_set_*")):
         names = list(CONFIG.contract("test", "1.2.3").inputs)
-        found = evaluator.run(None, dict(zip(names, stored(folder, "input", 5), strict=True)))
+        feed = dict(zip(names, stored(folder, "input", 5), strict=True))
+        found = list(evaluator.run(None, feed))
         trajectories, probabilities = stored(folder, "output", 2)
         np.testing.assert_allclose(found[0], trajectories, atol=1e-3)
         np.testing.assert_allclose(found[1], probabilities, atol=1e-5)
 
 
 def stored(vector: Path, side: str, count: int) -> list[np.ndarray]:
+    """The tensors of one side of a test vector, in order."""
     paths = [vector / f"{side}_{index}.pb" for index in range(count)]
     return [onnx.numpy_helper.to_array(onnx.load_tensor(path)) for path in paths]
 

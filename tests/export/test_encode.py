@@ -13,11 +13,11 @@ from eqrt.core.routes import RouteFinder
 from eqrt.core.scene import Scene, build_scene
 from eqrt.core.tile import TileInfo, decode, encode
 from eqrt.export.encode import ObjectIds, choose_ego, drive_messages, joined, moved, write_candump
+from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.predictor import DEFAULT_ARTIFACT, Prediction, Predictor
-from eqrt.runtime.profile import load_profile
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Prediction, Predictor
+from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.replay import replay
-from eqrt.runtime.tiles import Tile
 from eqrt.training.commonroad import Scenario, lane_map, read_scenario
 from eqrt.training.data import TrackGrid
 
@@ -52,7 +52,9 @@ def scenes_from_can(scenario: Scenario) -> list[Scene]:
     _, info = decode(encode(lanes, TileInfo(name="t", source="t", credit="")), "t")
     predictor = Listening(Predictor.load(DEFAULT_ARTIFACT))
     pipeline = Pipeline(load_profile("generic"), predictor, Tile(lanes, RouteFinder(lanes), info))  # type: ignore[arg-type]  # listens, else the same
-    assert all(f.num_targets for f in replay(pipeline, drive_messages([scenario], RANGE_M)))
+    forecasts = list(replay(pipeline, drive_messages([scenario], RANGE_M)))
+    assert len(forecasts) == len(choose_ego(scenario).step)
+    assert all(forecast.num_targets for forecast in forecasts[1:])
     return predictor.scenes
 
 
@@ -75,19 +77,18 @@ def test_a_scene_is_the_same_from_the_recording_and_over_can(
 ) -> None:
     """Every step, every target, every array, within what the object list's DBC resolves."""
     contract = Predictor.load(DEFAULT_ARTIFACT).contract
-    first = int(choose_ego(scenario).step[0])
+    first = int(choose_ego(scenario).step[-1]) + 1 - len(scenes_from_can)
     compared = same_lanes = 0
     for index, over_can in enumerate(scenes_from_can):
         direct = scene_directly(scenario, first + index, contract, over_can.origin)
         rows = matched(direct, over_can)
-        np.testing.assert_array_equal(over_can.history_valid[rows], direct.history_valid)
-        np.testing.assert_allclose(
-            over_can.history[rows], direct.history, atol=RESOLUTION_M + YAW_M
-        )
+        history, valid = in_the_order_of(direct, over_can, rows)
+        np.testing.assert_array_equal(valid, direct.history_valid)
+        np.testing.assert_allclose(history, direct.history, atol=RESOLUTION_M + YAW_M)
         np.testing.assert_allclose(over_can.heading[rows], direct.heading, atol=0.003)
-        valid = direct.centerlines_valid & over_can.centerlines_valid[rows]
+        on_lane = direct.centerlines_valid & over_can.centerlines_valid[rows]
         apart = np.linalg.norm(over_can.centerlines[rows] - direct.centerlines, axis=-1)
-        same = (np.where(valid, apart, 0.0) < 0.1).all(axis=(1, 2))
+        same = (np.where(on_lane, apart, 0.0) < 0.1).all(axis=(1, 2))
         same &= (direct.centerlines_valid == over_can.centerlines_valid[rows]).mean((1, 2)) > 0.98
         compared += len(rows)
         same_lanes += int(same.sum())
@@ -102,6 +103,23 @@ def matched(direct: Scene, over_can: Scene) -> np.ndarray:
     assert distance.shape[0] == distance.shape[1]
     assert distance.min(axis=1).max() < 0.05
     return np.asarray(distance.argmin(axis=1))
+
+
+def in_the_order_of(
+    direct: Scene, over_can: Scene, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Histories and masks over CAN, neighbours as in `direct`: a centimetre swaps equal distances.
+
+    Neighbours are told apart by the sum of where they were; the target stays first.
+    """
+    history, valid = over_can.history[rows], over_can.history_valid[rows]
+    apart = direct.history.sum(2)[:, :, None] - history.sum(2)[:, None]  # (B, N, N, 2)
+    order = np.linalg.norm(apart, axis=-1).argmin(axis=2)
+    np.testing.assert_array_equal(order[:, 0], 0)
+    full = valid.any(axis=2).all(axis=1)  # no empty rows, which are all alike
+    assert (np.sort(order[full], axis=1) == np.arange(order.shape[1])).all()
+    each = np.arange(len(rows))[:, None]
+    return history[each, order], valid[each, order]
 
 
 def test_object_ids_are_reused_late_and_flagged_as_new() -> None:

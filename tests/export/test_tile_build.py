@@ -17,7 +17,7 @@ from eqrt.core.errors import EqrtError, TileError
 from eqrt.core.lanes import NO_LANE, LaneMap, LaneType
 from eqrt.core.tile import TileInfo, decode
 from eqrt.export.tile_build import Origin, build_tile
-from eqrt.runtime.tiles import load_tile
+from eqrt.runtime.prediction.tiles import load_tile
 
 DATA = Path(__file__).parents[1] / "data"
 KARLSRUHE = DATA / "maps/lanelet2_example/mapping_example.osm.gz"

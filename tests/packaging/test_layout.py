@@ -21,7 +21,7 @@ FORBIDDEN = [  # a file, and what must not be imported in it
     ("runtime/eqrt/core/frames.py", "torch"),
     ("runtime/eqrt/core/frames.py", "can"),
     ("runtime/eqrt/core/frames.py", "eqrt.runtime"),
-    ("runtime/eqrt/runtime/detections.py", "eqrt.training"),
+    ("runtime/eqrt/runtime/decoding/detections.py", "eqrt.training"),
     ("runtime/eqrt/cli.py", "onnx"),
     ("training/eqrt/training/__init__.py", "eqrt.runtime"),
     ("export/eqrt/export/__init__.py", "eqrt.cli"),

@@ -13,7 +13,7 @@ import can
 import pytest
 
 from eqrt.core.errors import BusError
-from eqrt.runtime.buses import (
+from eqrt.runtime.bus.buses import (
     LOCAL,
     NetworkInterface,
     carries_fd,
@@ -21,7 +21,7 @@ from eqrt.runtime.buses import (
     network_interface,
     open_bus,
 )
-from eqrt.runtime.local_bus import LocalBus
+from eqrt.runtime.bus.local_bus import LocalBus
 from source_tree import ROOT
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="SocketCAN is Linux's")
@@ -36,7 +36,7 @@ MESSAGES = (
 )
 ECHO = """
 import sys
-from eqrt.runtime.buses import open_bus
+from eqrt.runtime.bus.buses import open_bus
 with open_bus(sys.argv[1], "eqrt_local") as bus:
     print("ready", flush=True)
     for _ in range(int(sys.argv[2])):
@@ -142,7 +142,7 @@ def test_the_local_bus_needs_no_network_but_loopback() -> None:
     program = f"""
 import subprocess
 subprocess.run(["{ip}", "link", "set", "lo", "up"], check=True)
-from eqrt.runtime.buses import open_bus
+from eqrt.runtime.bus.buses import open_bus
 import can
 with open_bus("c", "eqrt_local") as first, open_bus("c", "eqrt_local") as second:
     first.send(can.Message(arbitration_id=0x321))

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.datagrams import (
+from eqrt.runtime.output.datagrams import (
     MAX_BYTES,
     DatagramPublisher,
     decode_datagram,
     encode_datagrams,
 )
-from eqrt.runtime.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet
 from forecast_sets import many, nobody, one_car
 
 BAD_ADDRESSES = ["127.0.0.1", "nowhere", "127.0.0.1:port", "[::1]:99999", ":47310", ""]

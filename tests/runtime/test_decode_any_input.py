@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from can_recordings import detections_of, feed_all, messages_of
 from eqrt.core.errors import UsageError
-from eqrt.runtime.can_io import Decoder, Event
-from eqrt.runtime.detections import Detections, EgoMotion
-from eqrt.runtime.generic_objects import encode_cycle
-from eqrt.runtime.profile import builtin_profiles, load_profile
+from eqrt.runtime.decoding.can_io import Decoder, Event
+from eqrt.runtime.decoding.detections import Detections, EgoMotion
+from eqrt.runtime.decoding.generic_objects import encode_cycle
+from eqrt.runtime.decoding.profile import builtin_profiles, load_profile
 
 PROFILES = {name: load_profile(name) for name in builtin_profiles()}
 

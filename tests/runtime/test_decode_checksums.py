@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eqrt.runtime.checksums import Checksum, crc8, sum8, xor8
+from eqrt.runtime.decoding.checksums import Checksum, crc8, sum8, xor8
 
 
 @pytest.mark.parametrize(

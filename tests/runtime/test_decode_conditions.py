@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eqrt.runtime.conditions import ConditionError, Operand, parse_condition
+from eqrt.runtime.decoding.conditions import ConditionError, Operand, parse_condition
 
 NAN = float("nan")
 

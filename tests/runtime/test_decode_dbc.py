@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eqrt.runtime.profile
-from eqrt.runtime.dbc_files import Dbc, load_dbc
-from eqrt.runtime.dbc_tables import Column, SignalTable
+import eqrt.runtime.decoding.profile
+from eqrt.runtime.decoding.dbc_files import Dbc, load_dbc
+from eqrt.runtime.decoding.dbc_tables import Column, SignalTable
 
-FOLDER = Path(eqrt.runtime.profile.__file__).parent / "dbc"
+FOLDER = Path(eqrt.runtime.decoding.profile.__file__).parent / "dbc"
 SHIPPED = [
     "ars408.dbc",
     "srr520.dbc",

@@ -10,14 +10,14 @@ import can
 import cantools.database
 import pytest
 
-import eqrt.runtime.profile
+import eqrt.runtime.decoding.profile
 from eqrt.core.frames import Pose2
-from eqrt.runtime.can_io import Decoder, Event
-from eqrt.runtime.detections import EgoMotion, EgoPose
-from eqrt.runtime.profile import load_profile
+from eqrt.runtime.decoding.can_io import Decoder, Event
+from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
+from eqrt.runtime.decoding.profile import load_profile
 from tiny_sensor import EGO, GEAR, decoder_of, message
 
-SBG_DBC = Path(eqrt.runtime.profile.__file__).parent / "dbc" / "sbg" / "sbgCan.dbc"
+SBG_DBC = Path(eqrt.runtime.decoding.profile.__file__).parent / "dbc" / "sbg" / "sbgCan.dbc"
 
 WHEELS = """
 description = "speed from two wheels, with the gear for its direction"

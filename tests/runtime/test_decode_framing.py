@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from can_recordings import detections_of
-from eqrt.runtime.can_io import Decoder
-from eqrt.runtime.detections import Detections, ObjectClass, VelocityKind
+from eqrt.runtime.decoding.can_io import Decoder
+from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 from tiny_sensor import (
     COUNTED,
     FIRST,

@@ -17,11 +17,17 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2, wrap_angle
-from eqrt.runtime import generic_objects
-from eqrt.runtime.can_io import Decoder, Event
-from eqrt.runtime.detections import Detections, EgoMotion, EgoPose, ObjectClass, VelocityKind
-from eqrt.runtime.generic_objects import encode_cycle
-from eqrt.runtime.profile import load_profile
+from eqrt.runtime.decoding import generic_objects
+from eqrt.runtime.decoding.can_io import Decoder, Event
+from eqrt.runtime.decoding.detections import (
+    Detections,
+    EgoMotion,
+    EgoPose,
+    ObjectClass,
+    VelocityKind,
+)
+from eqrt.runtime.decoding.generic_objects import encode_cycle
+from eqrt.runtime.decoding.profile import load_profile
 
 Float64 = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from can_recordings import detections_of, feed_all, messages_of, rav4_array, srr520_objects
-from eqrt.runtime.can_io import Decoder, Event
-from eqrt.runtime.detections import Detections, EgoMotion, ObjectClass, VelocityKind
-from eqrt.runtime.profile import load_profile
+from eqrt.runtime.decoding.can_io import Decoder, Event
+from eqrt.runtime.decoding.detections import Detections, EgoMotion, ObjectClass, VelocityKind
+from eqrt.runtime.decoding.profile import load_profile
 from tiny_sensor import profile_of
 
 Float64 = NDArray[np.float64]

@@ -13,14 +13,14 @@ from typing import Any
 import can
 import cantools.database
 
-import eqrt.runtime.profile
-from eqrt.runtime.can_io import Decoder
-from eqrt.runtime.cycles import Cycle
-from eqrt.runtime.decoder_counters import DecoderCounters
-from eqrt.runtime.objects import ObjectDecoder
-from eqrt.runtime.profile import load_profile
+import eqrt.runtime.decoding.profile
+from eqrt.runtime.decoding.can_io import Decoder
+from eqrt.runtime.decoding.cycles import Cycle
+from eqrt.runtime.decoding.decoder_counters import DecoderCounters
+from eqrt.runtime.decoding.objects import ObjectDecoder
+from eqrt.runtime.decoding.profile import load_profile
 
-DBC = Path(eqrt.runtime.profile.__file__).parent / "dbc" / "ars408.dbc"
+DBC = Path(eqrt.runtime.decoding.profile.__file__).parent / "dbc" / "ars408.dbc"
 HEADER, GENERAL, QUALITY, EXTENDED = 0x60A, 0x60B, 0x60C, 0x60D
 NUM_OBJECTS = 100
 
@@ -119,8 +119,8 @@ def test_cantools_is_imported_only_when_a_profile_is_loaded() -> None:
     """It costs 50 ms and 3 MB."""
     program = (
         "import sys\n"
-        "from eqrt.runtime.can_io import Decoder\n"
-        "from eqrt.runtime.profile import load_profile\n"
+        "from eqrt.runtime.decoding.can_io import Decoder\n"
+        "from eqrt.runtime.decoding.profile import load_profile\n"
         "assert 'cantools' not in sys.modules\n"
         "load_profile('generic')\n"
         "assert 'cantools' in sys.modules\n"

@@ -10,8 +10,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from eqrt.core.frames import Pose2
-from eqrt.runtime.detections import EgoMotion, EgoPose
-from eqrt.runtime.ego import EgoTracker
+from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
+from eqrt.runtime.tracking.ego import EgoTracker
 from rav4_drive import Drive, read_drive
 
 

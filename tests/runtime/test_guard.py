@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eqrt.runtime.guard import guard
+from eqrt.runtime.prediction.guard import guard
 
 DT_S = 0.1
 STEPS = 30

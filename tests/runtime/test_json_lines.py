@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from eqrt.runtime.json_lines import json_lines
+from eqrt.runtime.output.json_lines import json_lines
 from forecast_sets import many, nobody, one_car
 
 

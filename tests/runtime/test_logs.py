@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eqrt.core.errors import LogError
-from eqrt.runtime.candump import candump_message
-from eqrt.runtime.logs import FORMATS, read_log
+from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.bus.logs import FORMATS, read_log
 from source_tree import ROOT
 
 DATA = ROOT / "tests/data/can"

@@ -15,8 +15,8 @@ import pytest
 
 from eqrt.cli import main
 from eqrt.core.errors import BusError, UsageError
-from eqrt.runtime.buses import LOCAL, open_bus
-from eqrt.runtime.logs import read_log
+from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.play import OTHERS, Player, parse_routes
 from source_tree import ROOT
 

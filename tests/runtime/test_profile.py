@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from eqrt.core.errors import ProfileError
-from eqrt.runtime import profile, profile_schema
-from eqrt.runtime.profile import builtin_profiles, load_profile
+from eqrt.runtime.decoding import profile, profile_schema
+from eqrt.runtime.decoding.profile import builtin_profiles, load_profile
 from tiny_sensor import COUNTED, DBC, SENSOR, SLOTS, profile_of
 
 

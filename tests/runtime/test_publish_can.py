@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from eqrt.core.errors import UsageError
 from eqrt.core.frames import Pose2
-from eqrt.runtime import can_output
-from eqrt.runtime.buses import open_bus
-from eqrt.runtime.can_output import Offset, encode_classic, encode_fd
-from eqrt.runtime.forecasts import ForecastSet, Mode
-from eqrt.runtime.publish_can import BASE_ID, CanPublisher
+from eqrt.runtime.bus.buses import open_bus
+from eqrt.runtime.output import can_output
+from eqrt.runtime.output.can_output import Offset, encode_classic, encode_fd
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher
 from forecast_sets import many, nobody, one_car
 from source_tree import ROOT
 
-DBC = ROOT / "runtime/eqrt/runtime/dbc/eqrt.dbc"
+DBC = ROOT / "runtime/eqrt/runtime/output/eqrt.dbc"
 ENCODING_BUDGET_S = 0.001  # p99 for 32 objects on the reference machine (2 cores)
 NOT_AVAILABLE = "NOT_AVAILABLE"
 CHANNELS = (f"publish-{number}" for number in itertools.count())

@@ -13,7 +13,7 @@ from eqrt.cli import main
 from eqrt.core.errors import TileError
 from eqrt.core.lanes import Lane, build_lane_map, middle_line
 from eqrt.core.tile import TileInfo, encode
-from eqrt.runtime.tiles import load_tile, save_tile
+from eqrt.runtime.prediction.tiles import load_tile, save_tile
 
 ROAD = np.array([[0.0, 0.0], [1000.0, 0.0]])
 TILE = encode(

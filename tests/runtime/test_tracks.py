@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
-from eqrt.runtime.can_io import Decoder
-from eqrt.runtime.detections import Detections, EgoMotion, ObjectClass, VelocityKind
-from eqrt.runtime.ego import EgoState, EgoTracker
-from eqrt.runtime.logs import read_log
-from eqrt.runtime.profile import load_profile
-from eqrt.runtime.track_history import resample
-from eqrt.runtime.tracks import TrackStore
+from eqrt.runtime.bus.logs import read_log
+from eqrt.runtime.decoding.can_io import Decoder
+from eqrt.runtime.decoding.detections import Detections, EgoMotion, ObjectClass, VelocityKind
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.tracking.ego import EgoState, EgoTracker
+from eqrt.runtime.tracking.track_history import resample
+from eqrt.runtime.tracking.tracks import TrackStore
 from rav4_drive import read_events
 
 AT_ORIGIN = Pose2()

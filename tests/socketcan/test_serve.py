@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from cantools.database.can import Database
 
-from eqrt.runtime.forecasts import Mode
+from eqrt.runtime.output.forecasts import Mode
 from socketcan.machine import Completed
 from socketcan.vcan import Launcher, program
 from source_tree import ROOT
 
 LOG = ROOT / "tests/data/can/ars408/candump.log.gz"
-DBC = ROOT / "runtime/eqrt/runtime/dbc/eqrt.dbc"
+DBC = ROOT / "runtime/eqrt/runtime/output/eqrt.dbc"
 NUM_CYCLES = 80
 """Of the recording, 5.8 s: the parked car's radar sees one object first, then up to four."""
 RESOLUTION_M = 0.02  # of positions in eqrt.dbc

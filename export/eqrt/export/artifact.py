@@ -19,7 +19,7 @@ from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
 from eqrt.export.to_onnx import to_onnx
 from eqrt.export.vectors import named_scenes
-from eqrt.runtime.predictor import Predictor
+from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.training.checkpoint import Card
 
 AGREEMENT_M = 1e-3

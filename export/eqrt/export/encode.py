@@ -22,17 +22,17 @@ from eqrt.core.errors import EqrtError, UsageError
 from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.core.lanes import NO_LANE, LaneMap
 from eqrt.core.tile import TileInfo, encode
-from eqrt.runtime.detections import Detections, ObjectClass, VelocityKind
-from eqrt.runtime.generic_objects import MAX_OBJECT_ID, encode_cycle
-from eqrt.runtime.tiles import save_tile
+from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
+from eqrt.runtime.decoding.generic_objects import MAX_OBJECT_ID, encode_cycle
+from eqrt.runtime.prediction.tiles import save_tile
 from eqrt.training.commonroad import Scenario, Track, lane_map, read_scenario
 
 APART_M = 3000.0
 """Between the scenarios of one drive: no lane or car of one is near another."""
 PAUSE_S = 0.5
 """Between the scenarios, in time."""
-MESSAGE_S = 0.00025
-"""A classic message of eight bytes on a bus of 500 kbit/s."""
+MESSAGE_S = 0.0003
+"""A classic message of eight bytes on a bus of 500 kbit/s, and the pause after it."""
 _START_S = 1.7e9  # any wall-clock time; the same for the same drive
 _LANE_IDS = 10_000_000  # more than any scenario's ids
 _CLASSES = {
@@ -132,12 +132,11 @@ def drive_messages(scenarios: Sequence[Scenario], range_m: float) -> Iterator[ca
                 speed_mps=float(ego.speed_mps[index]),
                 yaw_rate_rad_s=_yaw_rate(ego, index, scenario.dt_s),
                 map_from_ego=_pose(ego, index),
+                message_s=MESSAGE_S,
                 channel="can0",
             )
             counter += 1
-            for place, message in enumerate(cycle):
-                message.timestamp = time_s + place * MESSAGE_S
-                yield message
+            yield from cycle
         start_s += len(ego.step) * scenario.dt_s + PAUSE_S
 
 

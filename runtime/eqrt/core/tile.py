@@ -44,6 +44,12 @@ class TileInfo:
     tile_id: str = ""
     """Eight hex digits that change with any byte of the file; `decode` fills it in."""
 
+    @property
+    def origin_deg(self) -> tuple[float, float] | None:
+        """Latitude and longitude of the map frame's origin, None = not known."""
+        origin = (self.origin_latitude_deg, self.origin_longitude_deg)
+        return None if any(math.isnan(degrees) for degrees in origin) else origin
+
 
 @dataclass(frozen=True, slots=True)
 class _Counts:

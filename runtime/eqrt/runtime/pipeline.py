@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
 from eqrt.core.scene import AgentHistories, Scene, build_scene, concatenate, tile_origin
-from eqrt.runtime.can_io import Decoder, Event
-from eqrt.runtime.detections import Detections, EgoMotion, EgoPose
-from eqrt.runtime.ego import EgoState, EgoTracker
-from eqrt.runtime.forecasts import ForecastSet, Mode
-from eqrt.runtime.guard import Guarded, guard
-from eqrt.runtime.predictor import Predictor
-from eqrt.runtime.profile import Profile
-from eqrt.runtime.tiles import Tile
-from eqrt.runtime.tracks import Tracks, TrackStore
+from eqrt.runtime.decoding.can_io import Decoder, Event
+from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
+from eqrt.runtime.decoding.profile import Profile
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.prediction.guard import Guarded, guard
+from eqrt.runtime.prediction.predictor import Predictor
+from eqrt.runtime.prediction.tiles import Tile
+from eqrt.runtime.tracking.ego import EgoState, EgoTracker
+from eqrt.runtime.tracking.tracks import Tracks, TrackStore
 
 MIN_PERIOD = 0.6
 """Cycles closer together than this many model steps share a prediction: radars send up to 20 Hz."""
@@ -80,7 +80,7 @@ class Pipeline:
         `stationary`: the sensor stands still, and nothing on the bus says so. `clock` tells the
         pipeline's time while it computes; None = no time passes (replay).
         """
-        self.decoder = Decoder(profile, channels)
+        self.decoder = Decoder(profile, channels, tile.info.origin_deg if tile else None)
         self.ego = EgoTracker(
             yaw_rate_bias_rad_s=profile.yaw_rate_bias_rad_s,
             stationary=stationary or not profile.has_ego,

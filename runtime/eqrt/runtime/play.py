@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import can
 
 from eqrt.core.errors import BusError, UsageError
-from eqrt.runtime.buses import carries_fd, open_bus
-from eqrt.runtime.logs import read_log
+from eqrt.runtime.bus.buses import carries_fd, open_bus
+from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.signals import until_told_to_stop
 
 _LONGEST_WAIT_S = 60.0  # a longer silence in the log, like a clock that was set, is not waited for

@@ -18,12 +18,12 @@ from typing import BinaryIO
 import can
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.channels import parse_channels
-from eqrt.runtime.forecasts import ForecastSet
-from eqrt.runtime.json_lines import json_lines
-from eqrt.runtime.logs import read_log
+from eqrt.runtime.bus.channels import parse_channels
+from eqrt.runtime.bus.logs import read_log
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.profile import load_profile
 from eqrt.runtime.serve import add_pipeline_arguments, load_pipeline
 
 

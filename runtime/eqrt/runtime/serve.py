@@ -6,22 +6,24 @@ import argparse
 import contextlib
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 import can
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.buses import open_bus
-from eqrt.runtime.channels import parse_channels
-from eqrt.runtime.datagrams import DatagramPublisher
+from eqrt.runtime.bus.buses import open_bus
+from eqrt.runtime.bus.channels import parse_channels
+from eqrt.runtime.decoding.profile import Profile, builtin_profiles, load_profile
+from eqrt.runtime.output.datagrams import DatagramPublisher
+from eqrt.runtime.output.publish_can import CanPublisher
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.predictor import DEFAULT_ARTIFACT, Predictor
-from eqrt.runtime.profile import Profile, builtin_profiles, load_profile
-from eqrt.runtime.publish_can import CanPublisher
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.service import Publisher, Receiver, Service
 from eqrt.runtime.signals import until_told_to_stop
-from eqrt.runtime.tiles import load_tile
 
 NO_CHANNEL = "none"
 
@@ -99,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         buses = _open_buses(args, profile, sorted(set(channels.values())), stack)
         pipeline = load_pipeline(args, profile, channels, clock=time.monotonic)
         publishers = _publishers(args, buses, stack)
-        receiver = _receiver(list(buses.values()), stack)
+        receiver = _receiver(buses, stack)
         report = _say_nothing if args.quiet else _say
         service = Service(pipeline, receiver, publishers, report)
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
@@ -120,25 +122,39 @@ def _open_buses(
     }
 
 
-def _receiver(buses: list[can.BusABC], stack: contextlib.ExitStack) -> Receiver:
+def _receiver(buses: Mapping[str, can.BusABC], stack: contextlib.ExitStack) -> Receiver:
     """One bus is read directly; several, in python-can's threads."""
     if len(buses) == 1:
-        return buses[0]
-    reader = can.BufferedReader()
-    notifier = can.Notifier(buses, [reader])
-    stack.callback(notifier.stop)
-    return _Buffered(reader)
+        return next(iter(buses.values()))
+    return stack.enter_context(Merged(buses))
 
 
-class _Buffered:
-    """A python-can reader in the shape of a bus."""
+class Merged:
+    """Several buses read as one, each by a thread of python-can's."""
 
-    def __init__(self, reader: can.BufferedReader) -> None:
-        self._reader = reader
+    def __init__(self, buses: Mapping[str, can.BusABC]) -> None:
+        self._messages: SimpleQueue[can.Message] = SimpleQueue()
+        self._notifiers = [
+            can.Notifier(bus, [partial(self._put, channel)]) for channel, bus in buses.items()
+        ]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next message of any bus."""
-        return self._reader.get_message(timeout or 0.0)
+        """The next message of any bus; its channel is the name that the bus was opened by."""
+        try:
+            return self._messages.get(timeout=timeout)
+        except Empty:
+            return None
+
+    def __enter__(self) -> Merged:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for notifier in self._notifiers:
+            notifier.stop()
+
+    def _put(self, channel: str, message: can.Message) -> None:
+        message.channel = channel  # some interfaces keep the sender's name for it
+        self._messages.put(message)
 
 
 def _publishers(

@@ -11,7 +11,7 @@ from typing import Protocol
 import can
 import numpy as np
 
-from eqrt.runtime.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.pipeline import Pipeline
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly

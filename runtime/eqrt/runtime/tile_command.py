@@ -18,7 +18,7 @@ import numpy as np
 from eqrt.core.errors import UsageError
 from eqrt.core.lane_lines import LaneLines
 from eqrt.core.tile import TileInfo
-from eqrt.runtime.tiles import Tile, load_tile, save_tile
+from eqrt.runtime.prediction.tiles import Tile, load_tile, save_tile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -243,8 +243,8 @@ class MotionInit(nn.Module):
             [
                 valid.to(step.dtype),
                 length(step),
-                dot(after - before, before) * (UNIT_M / speed),  # m/s per step, along
-                cross(before, after) * (UNIT_M / speed),  # and across
+                UNIT_M * dot(after - before, before) / speed,  # m/s per step, along
+                UNIT_M * cross(before, after) / speed,  # and across
                 length(slopes),
                 dot(slopes, other),
                 cross(slopes, other) * UNIT_M,

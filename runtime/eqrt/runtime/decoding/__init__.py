@@ -1,0 +1,1 @@
+"""CAN messages to detections and ego motion, as a profile says."""

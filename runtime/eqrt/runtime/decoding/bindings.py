@@ -1,0 +1,216 @@
+"""Names in a profile, bound to the bits of the DBC that they mean.
+
+The messages that describe one object (or the ego vehicle) are its parts. Binding a name gives a
+`Reference`: which part, and which row of the values that are decoded from it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.errors import ProfileError
+from eqrt.runtime.decoding.conditions import ConditionError, Evaluate, parse_condition
+from eqrt.runtime.decoding.dbc_files import DbcMessage
+from eqrt.runtime.decoding.dbc_tables import Column, Signal
+from eqrt.runtime.decoding.profile_schema import FieldTable, MeanTable, SpanTable
+from eqrt.runtime.decoding.units import FACTORS
+
+Values = Sequence[Any]
+"""By part, then by row of the part: floats, or arrays with one element per object."""
+
+_NAN = float("nan")
+_MAX_SPAN_BYTES = 8  # more than any signal in use spans; keeps the decoder to one shift
+_NUMBERED = re.compile(r"\{(slot|object)(?::(0?\d*[dxX]))?\}")
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """A column of a part."""
+
+    part: int
+    row: int
+
+
+@dataclass(frozen=True, slots=True)
+class BoundCondition:
+    """A condition of the profile, and where its operands come from."""
+
+    evaluate: Evaluate
+    operands: tuple[Reference, ...]
+
+    def holds(self, values: Values) -> Any:
+        """Truth, one per object if the values are arrays."""
+        return self.evaluate([values[operand.part][operand.row] for operand in self.operands])
+
+
+@dataclass(frozen=True, slots=True)
+class BoundField:
+    """A field of the profile in SI units: the mean of some columns, where `when` holds."""
+
+    columns: tuple[Reference, ...]
+    when: BoundCondition | None
+
+    def number(self, values: Values) -> float:
+        """The value, where `values` are floats; NaN = it is not there."""
+        if self.when is not None and not self.when.holds(values):
+            return _NAN
+        return float(self._mean(values))
+
+    def array(self, values: Values) -> NDArray[np.float64]:
+        """One value per object, where `values` are arrays; NaN = it is not there."""
+        mean: NDArray[np.float64] = self._mean(values)
+        return mean if self.when is None else np.where(self.when.holds(values), mean, _NAN)
+
+    def _mean(self, values: Values) -> Any:
+        first, *others = [values[column.part][column.row] for column in self.columns]
+        return sum(others, first) / len(self.columns) if others else first
+
+
+class Binder:
+    """Collects the columns that a profile asks for, part by part."""
+
+    def __init__(
+        self,
+        where: str,
+        parts: Mapping[str, Sequence[DbcMessage]],
+        *,
+        slots: Sequence[int] = (0,),
+        objects: Sequence[int] = (0,),
+    ) -> None:
+        """`parts`: name in the profile -> its messages, one per slot; `where` leads errors."""
+        self._where = where
+        self._parts = parts
+        self._names = list(parts)
+        self._slots = slots
+        self._objects = objects
+        self._rows: list[dict[tuple[str, float, bool], list[Column]]] = [{} for _ in parts]
+
+    def columns(self, part: int) -> list[Column]:
+        """The columns of a part: row after row, for every object in the message."""
+        return [column for row in self._rows[part].values() for column in row]
+
+    def field(self, key: str, entry: str | FieldTable | MeanTable, measure: str) -> BoundField:
+        """A field in SI units; `measure` says what it must measure."""
+        if isinstance(entry, str):
+            entry = FieldTable(signal=entry)
+        names = entry.mean if isinstance(entry, MeanTable) else [entry.signal]
+        sign = 1 if isinstance(entry, MeanTable) else entry.sign
+        if not names:
+            raise self.error(key, "mean is empty; name the signals")
+        columns = [
+            self.reference(key, name, sign * self._factor(key, name, entry.unit, measure))
+            for name in names
+        ]
+        when = None if entry.when is None else self.condition(f"{key}.when", entry.when)
+        return BoundField(tuple(columns), when)
+
+    def condition(self, key: str, text: str) -> BoundCondition:
+        """A condition on physical or raw values."""
+        try:
+            condition = parse_condition(text)
+        except ConditionError as error:
+            raise self.error(key, f"{text!r} is not a condition: {error}") from error
+        operands = [self.reference(key, x.name, raw=x.is_raw) for x in condition.operands]
+        return BoundCondition(condition.evaluate, tuple(operands))
+
+    def reference(
+        self, key: str, name: str, factor: float = 1.0, *, raw: bool = False
+    ) -> Reference:
+        """The column for PART.SIGNAL (or SIGNAL, where there is one part) times `factor`."""
+        part, signal = self._split(key, name)
+        rows = self._rows[part]
+        if (signal, factor, raw) not in rows:
+            found = [self._signal(key, part, signal, number) for number in self._objects]
+            rows[signal, factor, raw] = [
+                Column(x, 1.0, 0.0) if raw else Column(x, x.scale * factor, x.offset * factor)
+                for x in found
+            ]
+        return Reference(part, list(rows).index((signal, factor, raw)))
+
+    def signal(self, key: str, name: str) -> Signal:
+        """What PART.SIGNAL means, in the first slot and object."""
+        part, signal = self._split(key, name)
+        return self._signal(key, part, signal, self._objects[0])
+
+    def error(self, key: str, text: str) -> ProfileError:
+        """An error that says where in the profile it is."""
+        return ProfileError(f"{self._where}.{key}: {text}")
+
+    def _split(self, key: str, name: str) -> tuple[int, str]:
+        part, dot, signal = name.partition(".")
+        if not dot:
+            if len(self._names) > 1:
+                example = f"{self._names[0]}.{name}"
+                raise self.error(key, f"say which message {name!r} is in, for example {example!r}")
+            return 0, name
+        if part not in self._names:
+            known = ", ".join(self._names)
+            raise self.error(key, f"there is no message {part!r} here; there is {known}")
+        return self._names.index(part), signal
+
+    def _signal(self, key: str, part: int, name: str, number: int) -> Signal:
+        """The signal for one object in the message, which must be the same in every slot."""
+        found = [
+            self._signal_in(key, message, fill(name, slot=slot, object=number))
+            for slot, message in zip(self._slots, self._parts[self._names[part]], strict=True)
+        ]
+        layouts = [replace(signal, name=name) for signal in found]
+        for signal, layout in zip(found, layouts, strict=True):
+            if layout != layouts[0]:
+                raise self.error(key, f"{signal.name!r} is not laid out alike in every slot")
+        if layouts[0].last_byte - layouts[0].first_byte >= _MAX_SPAN_BYTES:
+            raise self.error(key, f"the signal {name!r} spans more than {_MAX_SPAN_BYTES} bytes")
+        return layouts[0]
+
+    def _signal_in(self, key: str, message: DbcMessage, name: str) -> Signal:
+        if name not in message.signals:
+            known = ", ".join(message.signals) or "none"
+            raise self.error(
+                key, f"the message {message.name} has no signal {name!r}; it has {known}"
+            )
+        return message.signals[name]
+
+    def _factor(self, key: str, name: str, unit: str | None, measure: str) -> float:
+        in_dbc = self.signal(key, name).unit.strip()
+        units = FACTORS[measure]
+        if unit is None:
+            unit = in_dbc
+            if unit not in units:
+                says = f"the unit {unit!r}" if unit else "no unit"
+                raise self.error(
+                    key, f"the DBC gives {name} {says}; add unit = one of {_quoted(units)}"
+                )
+        elif unit not in units:
+            raise self.error(key, f"unit {unit!r} is no {measure}; known are {_quoted(units)}")
+        return units[unit]
+
+
+def fill(name: str, **numbers: int) -> str:
+    """The name with `{slot}`, `{object}` (also `{slot:02d}`, `{slot:X}`) replaced by numbers."""
+    return _NUMBERED.sub(
+        lambda match: (
+            format(numbers[match[1]], match[2] or "d") if match[1] in numbers else match[0]
+        ),
+        name,
+    )
+
+
+def span(table: SpanTable | None, where: str) -> list[int]:
+    """The numbers of a span; [0] if there is none."""
+    if table is None:
+        return [0]
+    if not 0 <= table.first <= table.last < table.first + 256:
+        raise ProfileError(
+            f"{where}: first {table.first}, last {table.last} is no span of 1 to 256"
+        )
+    return list(range(table.first, table.last + 1))
+
+
+def _quoted(names: Mapping[str, float]) -> str:
+    return ", ".join(repr(name) for name in names)

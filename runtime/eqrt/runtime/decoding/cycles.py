@@ -1,0 +1,185 @@
+"""Framing: which messages belong to one measurement cycle of a sensor.
+
+The messages of a cycle arrive over some milliseconds; a `Cycle` is all of them. It is closed as
+soon as nothing is missing, else by a timeout or by what begins the next one.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from eqrt.runtime.decoding.dbc_tables import Payload
+from eqrt.runtime.decoding.decoder_counters import DecoderCounters
+from eqrt.runtime.decoding.sensor_profile import Part, SensorProfile
+
+_PATIENCE = 3
+"""Cycles without any message of an optional part, after which it is not waited for any more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cycle:
+    """The messages of one closed cycle."""
+
+    payloads: Sequence[Sequence[Payload]]
+    """By part: counted framing in order of arrival, else one per slot, empty where none came."""
+    header: Payload | None
+    count: int | None
+    """Objects in the cycle as the header says; None if it does not say."""
+    first_s: float
+    """Arrival of the first message."""
+    last_s: float
+    complete: bool
+
+
+def framing_of(sensor: SensorProfile, counters: DecoderCounters) -> Framing:
+    """The framing that the sensor's profile asks for."""
+    kind = CountedFraming if sensor.framing == "counted" else SlotFraming
+    return kind(sensor, counters)
+
+
+class Framing(ABC):
+    """Gathers one sensor's messages, and gives the cycles that each arrival closes."""
+
+    def __init__(self, sensor: SensorProfile, counters: DecoderCounters) -> None:
+        self._sensor = sensor
+        self._counters = counters
+        self._awaits = [True] * len(sensor.parts)
+        self._absences = [0] * len(sensor.parts)
+        self._is_open = False
+        self._begin(None, None, 0.0)
+        self._is_open = False
+
+    @abstractmethod
+    def add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:
+        """Take a message of an object; `slot` counts from 0."""
+
+    def open(self, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:
+        """Take a header: it ends the cycle before, and begins one if its count can be read."""
+        closed = self._close(complete=False)
+        header, count = self._sensor.header, None
+        if header is not None and header.count is not None:
+            number = header.count.read(data)
+            if not number >= 0.0:  # not there (NaN), or nonsense
+                self._counters.stray += 1
+                return closed
+            count = int(number)
+        self._begin(data, count, timestamp_s)
+        return closed if self._missing else closed + self._close(complete=True)
+
+    def expire(self, now_s: float) -> tuple[Cycle, ...]:
+        """Close a cycle older than the timeout, or one from before the clock was set back."""
+        timeout_s = self._sensor.timeout_s
+        if not self._is_open or -timeout_s <= now_s - self._first_s <= timeout_s:
+            return ()
+        return self._close(complete=False)
+
+    @abstractmethod
+    def _needed(self, part: Part) -> int:
+        """Messages of a part that the cycle has when it is complete."""
+
+    @abstractmethod
+    def _blank(self) -> list[Payload | None]:
+        """The payloads of one part before any has come."""
+
+    @property
+    def _num_messages(self) -> int | None:
+        """How many messages of one part the announced objects come in."""
+        if self._count is None:
+            return None
+        return -(-self._count // self._sensor.objects_per_message)
+
+    def _begin(self, header: Payload | None, count: int | None, timestamp_s: float) -> None:
+        self._is_open = True
+        self._header, self._count = header, count
+        self._first_s = self._last_s = timestamp_s
+        self._payloads = [self._blank() for _ in self._sensor.parts]
+        counts = [self._needed(part) for part in self._sensor.parts]
+        self._most = counts
+        self._awaited = [
+            count if awaits else 0 for count, awaits in zip(counts, self._awaits, strict=True)
+        ]
+        self._missing = sum(self._awaited)
+
+    def _close(self, *, complete: bool) -> tuple[Cycle, ...]:
+        if not self._is_open:
+            return ()
+        self._is_open = False
+        self._learn()
+        cycle = Cycle(
+            payloads=[[data or b"" for data in part] for part in self._payloads],
+            header=self._header,
+            count=self._count,
+            first_s=self._first_s,
+            last_s=self._last_s,
+            complete=complete,
+        )
+        return (cycle,)
+
+    def _learn(self) -> None:
+        """Which optional messages this sensor sends at all: some are sent only if configured."""
+        came = [sum(data is not None for data in part) for part in self._payloads]
+        if not came[0] or came[0] < self._most[0]:
+            return  # empty, or cut off: tells nothing
+        for i, part in enumerate(self._sensor.parts):
+            if part.optional:
+                self._absences[i] = 0 if came[i] else self._absences[i] + 1
+                self._awaits[i] = self._absences[i] < _PATIENCE
+
+    def _stray(self, part: int) -> None:
+        self._counters.stray += 1
+        if not self._awaits[part]:  # it is sent after all, behind the messages we waited for
+            self._awaits[part], self._absences[part] = True, 0
+
+
+class CountedFraming(Framing):
+    """A header with the number of objects, then their messages, part after part or mixed."""
+
+    def add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:  # noqa: ARG002  # there are no slots
+        """Take a message of an object."""
+        late = self.expire(timestamp_s)
+        if not self._is_open or len(self._payloads[part]) >= self._most[part]:
+            self._stray(part)
+            return late
+        self._payloads[part].append(data)
+        self._last_s = timestamp_s
+        if self._awaited[part]:
+            self._missing -= 1
+        return late if self._missing else late + self._close(complete=True)
+
+    def _needed(self, part: Part) -> int:
+        return part.per_cycle if part.per_cycle is not None else self._num_messages or 0
+
+    def _blank(self) -> list[Payload | None]:
+        return []
+
+
+class SlotFraming(Framing):
+    """One message id per slot and part; a slot that comes twice begins the next cycle.
+
+    With a header, only a header begins a cycle. `single` framing is that of one slot.
+    """
+
+    def add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:
+        """Take a message of a slot."""
+        closed = self.expire(timestamp_s)
+        if self._is_open and self._payloads[part][slot] is not None:
+            closed += self._close(complete=False)
+        if not self._is_open:
+            if self._sensor.header is not None:
+                self._stray(part)
+                return closed
+            self._begin(None, None, timestamp_s)
+        self._payloads[part][slot] = data
+        self._last_s = timestamp_s
+        if slot < self._awaited[part]:
+            self._missing -= 1
+        return closed if self._missing else closed + self._close(complete=True)
+
+    def _needed(self, part: Part) -> int:  # noqa: ARG002  # all parts have the same slots
+        slots = len(self._sensor.slots)
+        return slots if self._num_messages is None else min(self._num_messages, slots)
+
+    def _blank(self) -> list[Payload | None]:
+        return [None] * len(self._sensor.slots)

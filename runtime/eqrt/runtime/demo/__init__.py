@@ -1,0 +1,1 @@
+"""Recorded traffic through the real service, scored against what happened next."""

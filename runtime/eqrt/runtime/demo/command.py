@@ -1,0 +1,219 @@
+"""`eqrt demo`: recorded traffic over a CAN bus, predicted by the service and scored as it happens.
+
+    eqrt play  --messages-->  eqrt serve  --datagrams-->  this process: scores and draws
+
+Three processes and no CAN hardware: the bus is `eqrt_local`. Nothing here knows the future; the
+truth of a prediction is where the same track is measured a little later.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from eqrt.core.errors import EqrtError
+from eqrt.runtime.bus.buses import LOCAL
+from eqrt.runtime.demo.picture import render
+from eqrt.runtime.demo.score import Scoreboard
+from eqrt.runtime.demo.snapshots import BestMoment
+from eqrt.runtime.output.datagrams import decode_datagram
+from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.prediction.tiles import load_tile
+
+DATA = Path(__file__).parent / "data"
+_START_S = 20.0  # a service that has not said that it runs by then never will
+_SILENT_S = 3.0  # after the player has ended
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """One recording, and how the service reads it."""
+
+    name: str
+    about: str
+    log: Path
+    serve: tuple[str, ...]
+    tile: Path | None
+
+
+PARTS = (
+    Part(
+        name="ngsim",
+        about=(
+            "A minute of US traffic (NGSIM; none of it seen in training) on its real lanes:\n"
+            "one recorded car plays ego, the cars around it come as a CAN object list."
+        ),
+        log=DATA / "ngsim.log.gz",
+        serve=("--profile", "generic", "--tile", str(DATA / "ngsim.tile")),
+        tile=DATA / "ngsim.tile",
+    ),
+    Part(
+        name="rav4",
+        about=(
+            "Raw CAN of a Toyota RAV4 on a motorway (comma2k19): its radar, wheel speeds and yaw\n"
+            "rate, as the car sent them. No map; most radar tracks live less than a second."
+        ),
+        log=DATA / "rav4.log.gz",
+        serve=("--profile", "toyota-rav4"),
+        tile=None,
+    ),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `eqrt demo`."""
+    parser.add_argument(
+        "--part", choices=[part.name for part in PARTS], help="only this one (default: both)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, help="stop each part after that long (default: play all of it)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(), metavar="FOLDER", help="for the pictures (default: .)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play, predict, score and draw each part."""
+    parts = [part for part in PARTS if args.part in (None, part.name)]
+    for index, part in enumerate(parts):
+        print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
+        result = play_part(part, args.seconds)
+        result.print_summary()
+        picture = result.write_picture(args.out / f"eqrt-demo-{part.name}.svg")
+        print(f"  picture    {picture if picture else 'none: nothing could be scored'}")
+    return 0
+
+
+@dataclass(slots=True)
+class PartResult:
+    """What one part came to."""
+
+    part: Part
+    board: Scoreboard
+    moment: BestMoment
+    latencies_s: list[float]
+    first_s: float | None
+    """From starting the player to the first prediction."""
+
+    def print_summary(self) -> None:
+        """The figures, beside constant velocity's."""
+        if not self.board.count:
+            print("  no prediction could be scored: too short")
+            return
+        ours, baseline = self.board.tables()
+        print(f"\n  {self.board.count} predictions scored, mean errors in metres")
+        print(f"  {'':18}" + "".join(f"{name.replace('_', ' ').upper():>9}" for name in ours))
+        for label, table in (("eqrt", ours), ("constant velocity", baseline)):
+            print(f"  {label:18}" + "".join(f"{value:9.2f}" for value in table.values()))
+        p50, p99 = 1e3 * np.quantile(self.latencies_s, [0.5, 0.99])
+        print(f"  last measurement to prediction: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
+
+    def write_picture(self, path: Path) -> Path | None:
+        """One moment of the part as SVG, or None if none could be scored."""
+        moment = self.moment.picture(load_tile(self.part.tile) if self.part.tile else None)
+        if moment is None:
+            return None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(render(moment), encoding="utf-8")
+        return path.resolve()
+
+
+def play_part(part: Part, seconds: float | None) -> PartResult:
+    """Run one part to its end, a line a second."""
+    result = PartResult(part, Scoreboard(), BestMoment(), [], None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(0.2)
+        address = f"127.0.0.1:{receiver.getsockname()[1]}"
+        channel = f"eqrt-demo-{os.getpid()}"
+        with _service(part, channel, address), _player(part, channel) as player:
+            started_s = time.monotonic()
+            line_due_s = started_s + 1.0
+            for forecast in _forecasts(receiver, player, seconds):
+                _take(result, forecast, started_s)
+                if time.monotonic() >= line_due_s:
+                    print(_line(result, forecast, time.monotonic() - started_s), flush=True)
+                    line_due_s += 1.0
+    return result
+
+
+def _take(result: PartResult, forecast: ForecastSet, started_s: float) -> None:
+    if forecast.num_targets:
+        result.latencies_s.append(forecast.compute_s)
+        if result.first_s is None:
+            result.first_s = time.monotonic() - started_s
+    result.moment.add(forecast, result.board.add(forecast))
+
+
+def _line(result: PartResult, forecast: ForecastSet, seconds: float) -> str:
+    text = f"  {seconds:4.0f} s  {forecast.mode.name:<8} {forecast.num_targets:3d} objects"
+    if result.latencies_s:
+        text += f"  {1e3 * np.median(result.latencies_s[-10:]):5.1f} ms"
+    if result.board.count:
+        ours, baseline = result.board.tables()
+        text += (
+            f"   ADE 3 s {ours['ade_3s']:5.2f} m (constant velocity {baseline['ade_3s']:5.2f})"
+            f"   FDE 3 s {ours['fde_3s']:5.2f} m ({baseline['fde_3s']:5.2f})"
+        )
+    return text
+
+
+def _forecasts(
+    receiver: socket.socket, player: subprocess.Popen[str], seconds: float | None
+) -> Iterator[ForecastSet]:
+    """What the service says, until the player has ended and what it sent is answered."""
+    end_s = None if seconds is None else time.monotonic() + seconds
+    while end_s is None or time.monotonic() < end_s:
+        if player.poll() is not None and end_s is None:
+            end_s = time.monotonic() + _SILENT_S
+        with contextlib.suppress(TimeoutError):
+            yield decode_datagram(receiver.recv(65_535)).forecasts
+
+
+@contextlib.contextmanager
+def _service(part: Part, channel: str, address: str) -> Iterator[None]:
+    """`eqrt serve` in a process of its own, from when it listens until the end of the block."""
+    command = [*_eqrt("serve"), "--can", channel, "--can-interface", LOCAL, *part.serve]
+    with _process([*command, "--datagrams", address, "--out-can", channel, "--quiet"]) as service:
+        assert service.stdout is not None
+        ready = service.stdout.readline()
+        if not ready.startswith("eqrt serve:"):
+            raise EqrtError(f"the service did not start: {ready.strip() or 'it said nothing'}")
+        yield
+
+
+@contextlib.contextmanager
+def _player(part: Part, channel: str) -> Iterator[subprocess.Popen[str]]:
+    """`eqrt play` in a process of its own."""
+    command = [*_eqrt("play"), str(part.log), "--can", channel, "--can-interface", LOCAL]
+    with _process(command) as player:
+        yield player
+
+
+def _eqrt(command: str) -> list[str]:
+    return [sys.executable, "-m", "eqrt", command]
+
+
+@contextlib.contextmanager
+def _process(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.communicate(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()

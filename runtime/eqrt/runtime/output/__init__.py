@@ -1,0 +1,1 @@
+"""Predictions on CAN, as datagrams and as JSON lines."""

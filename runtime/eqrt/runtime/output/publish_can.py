@@ -1,0 +1,81 @@
+"""Forecasts on the CAN bus: what is sent when, and what happens if the bus does not take it."""
+
+from __future__ import annotations
+
+import can
+import numpy as np
+
+from eqrt.core.errors import UsageError
+from eqrt.runtime.bus.buses import carries_fd
+from eqrt.runtime.output.can_output import Offset, Rows, encode_classic, encode_fd
+from eqrt.runtime.output.forecasts import ForecastSet
+
+BASE_ID = 0x6E0
+"""The first id unless told otherwise: 16 from here on are free in the production-car and radar DBCs
+that we know, and lose arbitration against most of a car's own messages."""
+_LAST_STANDARD_ID, _LAST_EXTENDED_ID = 0x7FF, 0x1FFFFFFF
+
+
+class CanPublisher:
+    """Sends every cycle's forecasts on a bus: CAN FD if it carries that, else classic CAN.
+
+    A message that the bus does not take is counted and given up; nothing is raised or waited for.
+    """
+
+    def __init__(self, bus: can.BusABC, *, base_id: int = BASE_ID, num_modes: int = 1) -> None:
+        """`num_modes`: how many of an object's modes to send on CAN FD, most probable first.
+
+        Raises UsageError if the ids from `base_id` on are not all standard or all extended.
+        """
+        last_id = base_id + max(Offset)
+        if not 0 <= base_id <= _LAST_EXTENDED_ID - max(Offset) or (
+            base_id <= _LAST_STANDARD_ID < last_id
+        ):
+            raise UsageError(
+                f"the output's first CAN id is {base_id:#x}; give one up to "
+                f"{_LAST_STANDARD_ID - max(Offset):#x}, or an extended one from "
+                f"{_LAST_STANDARD_ID + 1:#x} to {_LAST_EXTENDED_ID - max(Offset):#x}"
+            )
+        self._bus = bus
+        self._base_id = base_id
+        self._num_modes = num_modes
+        self._alive = dict.fromkeys(Offset, 0)
+        self.is_fd = carries_fd(bus)
+        self.sent = 0
+        """Messages that the bus took."""
+        self.failed = 0
+        """Messages that it did not: its buffer was full, or it is down."""
+
+    def publish(self, forecasts: ForecastSet) -> None:
+        """Send the messages of one cycle."""
+        if self.is_fd:
+            messages = encode_fd(forecasts, self._num_modes)
+        else:
+            messages = encode_classic(forecasts)
+        for offset, rows in messages:
+            self._count(offset, rows)
+            self._send(self._base_id + offset, rows)
+
+    def _count(self, offset: Offset, rows: Rows) -> None:
+        """Number the messages of one id, so that a consumer sees if one was lost."""
+        counts = self._alive[offset] + np.arange(len(rows))
+        rows["alive"] |= (counts & (0xFF if self.is_fd else 0x0F)).astype(np.uint8)
+        self._alive[offset] = (self._alive[offset] + len(rows)) & 0xFF
+
+    def _send(self, arbitration_id: int, rows: Rows) -> None:
+        payload, size = rows.tobytes(), rows.itemsize
+        for start in range(0, len(payload), size):
+            message = can.Message(
+                arbitration_id=arbitration_id,
+                is_extended_id=arbitration_id > _LAST_STANDARD_ID,
+                is_fd=self.is_fd,
+                bitrate_switch=self.is_fd,
+                is_rx=False,
+                data=payload[start : start + size],
+            )
+            try:
+                self._bus.send(message)
+            except (can.CanError, OSError):
+                self.failed += 1
+            else:
+                self.sent += 1

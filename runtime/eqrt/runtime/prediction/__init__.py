@@ -1,0 +1,1 @@
+"""The model file, the map tile, and the last check on what they give."""

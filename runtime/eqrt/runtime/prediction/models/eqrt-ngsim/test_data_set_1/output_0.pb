@@ -1,0 +1,1 @@
+BtrajectoriesJðó$ØÃÄXUCDpØÃŠeVC’»ØÃsWCßÙÃ}XC.RÙÃ¥YC„ÙÃ’ ZCâèÙÃB±[CJ4ÚÃ°Â\C¾ÚÃÛÔ]C?ËÚÃ»ç^CÍÛÃMû_CibÛÃ‹aC®ÛÃm$bCÉùÛÃë9cCŒEÜÃþOdCZ‘ÜÃ›feC2ÝÜÃ·}fC)ÝÃG•gCøtÝÃ=­hCäÀÝÃ‹ÅiCÔÞÃ!ÞjCÆXÞÃîökCº¤ÞÃßmC¯ðÞÃâ(nC¤<ßÃÞAoC›ˆßÃÀZpC”ÔßÃmsqC“ àÃÌ‹rC™làÃÂ£sC­¸àÃ2»tC

@@ -1,0 +1,156 @@
+"""The model file, checked and run. The only module that knows onnxruntime.
+
+An artifact is a folder (docs/design.md): `model.onnx`, `SHA256SUMS`, test vectors. Its checksum is
+compared before the file is parsed (onnxruntime loads most files with a flipped bit, and some of
+those predict something else), then a stored test vector is run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.contract import METADATA_KEY, ModelContract
+from eqrt.core.errors import ContractError
+from eqrt.core.scene import Scene
+from eqrt.runtime.prediction.tensor_proto import read_tensor
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+DEFAULT_ARTIFACT = Path(__file__).parent / "models" / "eqrt-ngsim"
+"""The model that ships with eqrt."""
+SELF_CHECK_M = 1e-3
+"""A test vector must come back within a millimetre."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Trajectories of B targets."""
+
+    trajectories: NDArray[np.float64]
+    """(B, K, H, 2) metres, map frame, most probable mode first."""
+    probabilities: NDArray[np.float32]
+    """(B, K)"""
+
+
+class Predictor:
+    """An artifact, loaded and proven by its own test vector."""
+
+    def __init__(self, session: onnxruntime.InferenceSession, contract: ModelContract, sha256: str):
+        self._session = session
+        self.contract = contract
+        self.model_id = sha256[:8]
+        """First digits of the model file's SHA-256: which model made a prediction."""
+
+    @classmethod
+    def load(cls, folder: Path, threads: int = 1) -> Predictor:
+        """Check and load an artifact.
+
+        Raises ContractError if a file is missing or damaged, the contract is another version, the
+        graph's tensors differ from it, or the test vector comes out differently.
+        """
+        content = _read_checked(folder)
+        session = _session(content, folder, threads)
+        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        if text is None:
+            raise ContractError(
+                f"{folder / 'model.onnx'}: no {METADATA_KEY!r} metadata, so this is not an eqrt "
+                f"model; `eqrt export` writes one"
+            )
+        contract = ModelContract.from_json(text, str(folder / "model.onnx"))
+        _check_tensors(session, contract, folder)
+        predictor = cls(session, contract, hashlib.sha256(content).hexdigest())
+        predictor._self_check(folder)
+        return predictor
+
+    def predict(self, scene: Scene) -> Prediction:
+        """One run for all targets of the scene."""
+        trajectories, probabilities = self._session.run(None, scene.inputs())
+        return Prediction(trajectories + scene.origin, probabilities)
+
+    def _self_check(self, folder: Path) -> None:
+        vectors = sorted(folder.glob("test_data_set_*"))
+        if not vectors:
+            raise ContractError(f"{folder}: no test_data_set_*; export the model again")
+        feed = _tensors(vectors[0], "input", list(self.contract.inputs))
+        expected = _tensors(vectors[0], "output", list(self.contract.outputs))
+        found = self._session.run(None, feed)
+        for name, value in zip(expected, found, strict=True):
+            error = float(np.abs(value - expected[name]).max())
+            if not error <= SELF_CHECK_M:
+                raise ContractError(
+                    f"{vectors[0]}: the model's {name} differ by {error:.4g} from the stored ones "
+                    f"(allowed {SELF_CHECK_M}); this file or this onnxruntime is not to be trusted"
+                )
+
+
+def _read_checked(folder: Path) -> bytes:
+    """The bytes of `model.onnx`, after comparing them with SHA256SUMS."""
+    try:
+        content = (folder / "model.onnx").read_bytes()
+        sums = (folder / "SHA256SUMS").read_text(encoding="utf-8")
+    except OSError as error:
+        raise ContractError(
+            f"{error.filename}: {error.strerror}; a model is a folder with model.onnx and "
+            f"SHA256SUMS, as `eqrt export` writes it"
+        ) from error
+    listed = {line[66:]: line[:64] for line in sums.splitlines()}  # the format of sha256sum
+    found = hashlib.sha256(content).hexdigest()
+    if listed.get("model.onnx") != found:
+        raise ContractError(
+            f"{folder / 'model.onnx'}: its SHA-256 is {found[:12]}..., SHA256SUMS says "
+            f"{str(listed.get('model.onnx'))[:12]}...; the file is damaged: copy it again"
+        )
+    return content
+
+
+def _session(content: bytes, folder: Path, threads: int) -> onnxruntime.InferenceSession:
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read when onnxruntime is first imported
+    import onnxruntime  # noqa: PLC0415 (so that the line above comes first)
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(
+            content,
+            options,
+            providers=["CPUExecutionProvider"],
+            disabled_optimizers=["SkipLayerNormFusion"],  # slower on a CPU than Add + LayerNorm
+        )
+    except Exception as error:  # onnxruntime raises its own classes, with no common base
+        first_line = str(error).splitlines()[0]
+        raise ContractError(
+            f"{folder / 'model.onnx'}: onnxruntime {onnxruntime.__version__} cannot load it "
+            f"({first_line})"
+        ) from error
+
+
+def _check_tensors(session: Any, contract: ModelContract, folder: Path) -> None:
+    found = {t.name: (t.type, t.shape) for t in [*session.get_inputs(), *session.get_outputs()]}
+    for name, (kind, shape) in (contract.inputs | contract.outputs).items():
+        onnx_kind = f"tensor({'float' if kind == 'float32' else kind})"
+        actual = found.pop(name, None)
+        fits = actual is not None and actual[0] == onnx_kind and list(actual[1][1:]) == [*shape[1:]]
+        if not fits:
+            raise ContractError(
+                f"{folder / 'model.onnx'}: tensor {name!r} is {actual}, the contract says "
+                f"{onnx_kind} {list(shape)}; export the model again"
+            )
+    if found:
+        raise ContractError(
+            f"{folder / 'model.onnx'}: tensor {next(iter(found))!r} is not in the contract"
+        )
+
+
+def _tensors(folder: Path, side: str, names: list[str]) -> dict[str, NDArray[Any]]:
+    return {name: read_tensor(folder / f"{side}_{i}.pb") for i, name in enumerate(names)}

@@ -1,0 +1,1 @@
+"""Detections to tracks in the map frame, the ego vehicle's motion taken out."""

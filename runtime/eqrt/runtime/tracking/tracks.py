@@ -1,0 +1,277 @@
+"""Identity over time: which detections are the same object, and where it was.
+
+A sensor reuses its object ids, so an identity is (sensor, id, epoch): the epoch ends when the
+sensor flags a new object, after a gap, at a jump no vehicle can make, and when the map frame itself
+jumps. Each gets a `track_id` that never comes again. Detections are placed in the map frame at
+their own time, so that the ego's motion is gone from the histories.
+
+Everything lives in arrays of fixed size: rows for tracks, right-aligned columns for measurements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.frames import Pose2
+from eqrt.runtime.decoding.detections import Detections
+from eqrt.runtime.tracking.ego import EgoState
+from eqrt.runtime.tracking.measurements import Measurements, measure
+from eqrt.runtime.tracking.track_history import (
+    MAX_GAP_S,
+    SAME_TIME_S,
+    Float64,
+    fit_velocity,
+    resample,
+)
+
+MOVING_MPS = 1.0
+"""An object faster than this over ground moves."""
+_FORGET_S = 2.0  # an object unseen for longer leaves the store; neighbors keep their past till then
+_MAX_CLOCK_STEP_S = 1.0  # a cycle older than the newest by more: the clock was set back
+# How far from its expected place a measurement may lie and still be the same object.
+_JUMP_M = 2.0  # the reflection wanders over a vehicle
+_JUMP_PER_RANGE = 0.02  # 1.1 degrees of bearing noise
+_JUMP_KNOWN_MPS = 15.0  # how wrong a velocity fitted or measured may be
+_JUMP_UNKNOWN_MPS = 80.0  # faster over ground than anything on a road
+_NO_ROW = -1
+
+Index = NDArray[np.intp]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tracks:
+    """The objects seen recently. Arrays share the axis M; map frame; NaN = not known."""
+
+    row: Index
+    """(M,) what `TrackStore.history` calls them; good until the next `update`."""
+    track_id: NDArray[np.int64]
+    """(M,) unique as long as the store lives."""
+    sensor: NDArray[np.intp]
+    """(M,) index into `TrackStore.sensors`."""
+    object_id: NDArray[np.int64]
+    """(M,) as the sensor numbers it."""
+    timestamp_s: Float64
+    """(M,) of the last measurement."""
+    position: Float64
+    """(M, 2) metres, the last measurement."""
+    velocity: Float64
+    """(M, 2) m/s over ground as measured."""
+    speed_mps: Float64
+    """(M,) over ground: measured, else from the displacement of the last second."""
+    is_moving: Bool
+    """(M,) faster than 1 m/s over ground; False while the speed is not known."""
+    heading_rad: Float64
+    """(M,) as measured."""
+    object_class: NDArray[np.uint8]
+    """(M,) `ObjectClass`."""
+    length_m: Float64
+    """(M,)"""
+    width_m: Float64
+    """(M,)"""
+    existence: Float64
+    """(M,) probability 0..1."""
+    num_measurements: NDArray[np.int64]
+    """(M,) of this object so far."""
+
+
+@dataclass(slots=True)
+class TrackCounters:
+    """What became of the detections."""
+
+    cycles: int = 0
+    measurements: int = 0
+    """Detections that became part of a track."""
+    tracks: int = 0
+    """Tracks begun."""
+    ids_reused: int = 0
+    """Tracks begun on an id that another object held until then."""
+    refused: int = 0
+    """Detections whose position is not finite or not possible."""
+    duplicates: int = 0
+    """Detections whose id came before in the same cycle."""
+    late: int = 0
+    """Detections not newer than their track."""
+    without_ego: int = 0
+    """Cycles at whose time the ego's pose is not known: ignored."""
+    dropped: int = 0
+    """Tracks forgotten, or not begun, because the store was full."""
+    resets: int = 0
+    """Times that all tracks were forgotten: the map frame jumped or the clock was set back."""
+
+
+class TrackStore:
+    """Up to `capacity` tracks of up to `depth` measurements each."""
+
+    def __init__(self, *, capacity: int = 256, depth: int = 64) -> None:
+        self.counters = TrackCounters()
+        self.sensors: list[str] = []
+        """Names, in order of appearance."""
+        self._next_track_id = 1
+        self._ego_epoch: int | None = None
+        self._newest_s = -np.inf
+        self._used = np.zeros(capacity, np.bool_)
+        self._sensor = np.zeros(capacity, np.intp)
+        self._object_id = np.zeros(capacity, np.int64)
+        self._track_id = np.zeros(capacity, np.int64)
+        self._count = np.zeros(capacity, np.int64)
+        self._times_s = np.full((capacity, depth), -np.inf)
+        self._positions = np.full((capacity, depth, 2), np.nan)
+        self._fitted_velocity = np.full((capacity, 2), np.nan)
+        self._velocity = np.full((capacity, 2), np.nan)
+        self._heading_rad = np.full(capacity, np.nan)
+        self._length_m = np.full(capacity, np.nan)
+        self._width_m = np.full(capacity, np.nan)
+        self._existence = np.full(capacity, np.nan)
+        self._object_class = np.zeros(capacity, np.uint8)
+
+    def update(self, detections: Detections, ego: EgoState | None, ego_from_sensor: Pose2) -> None:
+        """Take one cycle, measured from `ego` (the state at its timestamp)."""
+        self.counters.cycles += 1
+        if ego is None:
+            self.counters.without_ego += 1
+            return
+        now_s = detections.timestamp_s
+        self._advance(now_s, ego.epoch)
+        sensor = self._sensor_index(detections.sensor)
+        found = self._admit(measure(detections, ego, ego_from_sensor))
+        row = self._match(sensor, found.object_id)
+        on_time = (row == _NO_ROW) | (self._times_s[row, -1] < now_s)
+        self.counters.late += int(np.count_nonzero(~on_time))
+        found, row = found.take(on_time), row[on_time]
+        begins = ~self._continues(row, found, now_s)
+        self.counters.ids_reused += int(np.count_nonzero(begins & (row != _NO_ROW)))
+        row = self._with_room(row)
+        kept = row != _NO_ROW
+        found, row, begins = found.take(kept), row[kept], begins[kept]
+        self._begin(row[begins], sensor, found.object_id[begins])
+        self._append(row, now_s, found)
+
+    def snapshot(self, now_s: float, max_age_s: float = MAX_GAP_S) -> Tracks:
+        """The tracks whose last measurement is at most `max_age_s` old (or after `now_s`)."""
+        row = np.flatnonzero(self._used & (self._times_s[:, -1] >= now_s - max_age_s - SAME_TIME_S))
+        velocity = self._velocity[row]
+        speed_mps = np.hypot(velocity[:, 0], velocity[:, 1])
+        fitted = self._fitted_velocity[row]
+        speed_mps = np.where(np.isnan(speed_mps), np.hypot(fitted[:, 0], fitted[:, 1]), speed_mps)
+        return Tracks(
+            row=row,
+            track_id=self._track_id[row],
+            sensor=self._sensor[row],
+            object_id=self._object_id[row],
+            timestamp_s=self._times_s[row, -1],
+            position=self._positions[row, -1],
+            velocity=velocity,
+            speed_mps=speed_mps,
+            is_moving=speed_mps > MOVING_MPS,
+            heading_rad=self._heading_rad[row],
+            object_class=self._object_class[row],
+            length_m=self._length_m[row],
+            width_m=self._width_m[row],
+            existence=self._existence[row],
+            num_measurements=self._count[row],
+        )
+
+    def history(self, now_s: float, steps: int, dt_s: float, row: Index) -> tuple[Float64, Bool]:
+        """Where the tracks were at now_s - k dt_s, k = steps - 1 .. 0, see `resample`.
+
+        Positions (A, T, 2) in the map frame, NaN where not valid, and valid (A, T). `row` comes
+        from the snapshot. To end a track's history on a true measurement, let `now_s` be its
+        `timestamp_s`.
+        """
+        return resample(self._times_s[row], self._positions[row], now_s, steps, dt_s)
+
+    def _advance(self, now_s: float, ego_epoch: int) -> None:
+        """Bring the store to a cycle's time and frame."""
+        if ego_epoch != self._ego_epoch or now_s < self._newest_s - _MAX_CLOCK_STEP_S:
+            self._clear()
+            self._ego_epoch, self._newest_s = ego_epoch, now_s
+        self._newest_s = max(self._newest_s, now_s)
+        self._used &= self._times_s[:, -1] >= self._newest_s - _FORGET_S
+
+    def _clear(self) -> None:
+        self.counters.resets += bool(self._used.any())
+        self._used[:] = False
+
+    def _sensor_index(self, name: str) -> int:
+        if name not in self.sensors:
+            self.sensors.append(name)
+        return self.sensors.index(name)
+
+    def _admit(self, found: Measurements) -> Measurements:
+        """Those with a possible position and an id of their own."""
+        possible = ~np.isnan(found.position[:, 0])
+        self.counters.refused += int(np.count_nonzero(~possible))
+        found = found.take(possible)
+        first = np.zeros(len(found.object_id), np.bool_)
+        first[np.unique(found.object_id, return_index=True)[1]] = True
+        self.counters.duplicates += int(np.count_nonzero(~first))
+        return found.take(first)
+
+    def _match(self, sensor: int, object_id: NDArray[np.int64]) -> Index:
+        """Rows (D,) that hold these ids of this sensor."""
+        mine = np.flatnonzero(self._used & (self._sensor == sensor))
+        same = object_id[:, None] == self._object_id[mine]  # (D, mine)
+        which, of_mine = np.nonzero(same)
+        row = np.full(len(object_id), _NO_ROW)
+        row[which] = mine[of_mine]
+        return row
+
+    def _continues(self, row: Index, found: Measurements, now_s: float) -> Bool:
+        """Whether each measurement (D,) is of the object that its row holds."""
+        since_s = now_s - self._times_s[row, -1]
+        velocity = np.where(
+            np.isnan(self._fitted_velocity[row]), self._velocity[row], self._fitted_velocity[row]
+        )
+        is_known = ~np.isnan(velocity[:, 0])
+        step = np.where(is_known[:, None], velocity * since_s[:, None], 0.0)
+        off = found.position - self._positions[row, -1] - step
+        reach_m = since_s * np.where(is_known, _JUMP_KNOWN_MPS, _JUMP_UNKNOWN_MPS)
+        reach_m += _JUMP_M + _JUMP_PER_RANGE * found.range_m
+        near = np.hypot(off[:, 0], off[:, 1]) <= reach_m
+        is_soon = since_s <= MAX_GAP_S + SAME_TIME_S
+        same: Bool = (row != _NO_ROW) & ~found.is_new & is_soon & near
+        return same
+
+    def _with_room(self, row: Index) -> Index:
+        """Rows (D,) with a row for each new object too, at the cost of the stalest tracks."""
+        needed = int(np.count_nonzero(row == _NO_ROW))
+        free = np.flatnonzero(~self._used)
+        if needed > len(free):
+            self.counters.dropped += needed - len(free)
+            in_use = np.setdiff1d(np.flatnonzero(self._used), row)
+            stalest = in_use[np.argsort(self._times_s[in_use, -1], kind="stable")]
+            free = np.concatenate([free, stalest])
+        row = row.copy()
+        wanting = np.flatnonzero(row == _NO_ROW)[: len(free)]
+        row[wanting] = free[: len(wanting)]
+        return row
+
+    def _begin(self, row: Index, sensor: int, object_id: NDArray[np.int64]) -> None:
+        self._used[row] = True
+        self._sensor[row] = sensor
+        self._object_id[row] = object_id
+        self._track_id[row] = np.arange(self._next_track_id, self._next_track_id + len(row))
+        self._next_track_id += len(row)
+        self._count[row] = 0
+        self._times_s[row] = -np.inf
+        self._positions[row] = np.nan
+        self.counters.tracks += len(row)
+
+    def _append(self, row: Index, now_s: float, found: Measurements) -> None:
+        self._times_s[row, :-1] = self._times_s[row, 1:]
+        self._times_s[row, -1] = now_s
+        self._positions[row, :-1] = self._positions[row, 1:]
+        self._positions[row, -1] = found.position
+        self._fitted_velocity[row] = fit_velocity(self._times_s[row], self._positions[row])
+        self._velocity[row] = found.velocity
+        self._heading_rad[row] = found.heading_rad
+        self._length_m[row] = found.length_m
+        self._width_m[row] = found.width_m
+        self._object_class[row] = found.object_class
+        self._existence[row] = found.existence
+        self._count[row] += 1
+        self.counters.measurements += len(row)
