@@ -30,6 +30,10 @@ from eqrt.runtime.tracking.tracks import Tracks, TrackStore
 
 MIN_PERIOD = 0.6
 """Cycles closer together than this many model steps share a prediction: radars send up to 20 Hz."""
+TARGET_AGE_S = 0.3
+"""A track unseen for longer is not predicted any more."""
+NEIGHBOR_AGE_S = 0.5
+"""A track unseen for longer does not stand in any target's scene: `scene.RECENT_STEPS`."""
 SILENT_PERIODS = 3
 """After this many model steps without a cycle, everything said before is void."""
 _FINISH_S = 1.0  # longer than any profile's timeout
@@ -146,11 +150,12 @@ class Pipeline:
         return self._predict(ego, _Moment(timestamp_s, now_s, started_s))
 
     def _predict(self, ego: EgoState | None, moment: _Moment) -> ForecastSet:
-        tracks = self.tracks.snapshot(moment.measured_s)
-        if ego is None or not len(tracks.row):
+        tracks = self.tracks.snapshot(moment.measured_s, NEIGHBOR_AGE_S)
+        alive = tracks.timestamp_s >= moment.measured_s - TARGET_AGE_S
+        if ego is None or not alive.any():
             return self._forecast(*self._nobody, ego, moment)
         begun_s = self._time(moment.now_s)
-        scene, targets = self._targets(tracks, ego)
+        scene, targets = self._targets(tracks, alive, ego)
         scene_s = self._time(moment.now_s)
         prediction = self._predictor.predict(scene)
         infer_s = self._time(moment.now_s)
@@ -166,14 +171,14 @@ class Pipeline:
         self.counters.fallbacks += int(np.count_nonzero(~guarded.accepted))
         return self._forecast(targets, guarded, ego, moment)
 
-    def _targets(self, tracks: Tracks, ego: EgoState) -> tuple[Scene, _Targets]:
-        """Every track as a target, its history ending at its own last measurement.
+    def _targets(self, tracks: Tracks, alive: Bool, ego: EgoState) -> tuple[Scene, _Targets]:
+        """Every track that is alive as a target, its history ending at its own last measurement.
 
         Targets measured at the same time share a clock, so one scene is built per time.
         """
         origin = tile_origin(np.array([ego.map_from_ego.x_m, ego.map_from_ego.y_m]))
         scenes, parts = [], []
-        for anchor_s in np.unique(tracks.timestamp_s):
+        for anchor_s in np.unique(tracks.timestamp_s[alive]):
             rows = np.flatnonzero(tracks.timestamp_s == anchor_s)
             agents = self._agents(tracks, float(anchor_s))
             scenes.append(self._scene(agents, rows, ego, origin))
