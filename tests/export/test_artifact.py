@@ -41,6 +41,7 @@ CONFIG = ModelConfig(
     token_width=8,
     heads=2,
     pointers=2,
+    dropout=0.1,
 )
 CARD = Card(name="test", data="made up", license="Apache-2.0", metrics={"ade_3s": 1.0})
 

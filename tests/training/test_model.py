@@ -41,6 +41,7 @@ CONFIG = ModelConfig(
     token_width=16,
     heads=4,
     pointers=4,
+    dropout=0.1,
 )
 CONTRACT = CONFIG.contract("test", "0.0.0")
 SCENES = named_scenes(CONTRACT)

@@ -38,6 +38,7 @@ SILENT_PERIODS = 3
 """After this many model steps without a cycle, everything said before is void."""
 _FINISH_S = 1.0  # longer than any profile's timeout
 _CONTROL_S = 0.01  # how often silence and unfinished cycles are looked for
+_MAX_CLOCK_STEP_S = 1.0  # a cycle older than the newest by more: the clock was set back
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -63,7 +64,7 @@ class PipelineCounters:
     fallbacks: int = 0
     """Targets whose prediction the guard refused."""
     skipped: int = 0
-    """Sensor cycles that came too soon after a prediction to get their own."""
+    """Sensor cycles measured before or too soon after a prediction to get their own."""
 
 
 class Pipeline:
@@ -97,7 +98,7 @@ class Pipeline:
         self._tile = tile
         self._clock = clock
         self._nobody = _nobody(predictor.contract)
-        self._control_due_s = -np.inf
+        self._controlled_s = -np.inf
         self._predicted_s = -np.inf
         self._silent_due_s = np.inf
 
@@ -110,12 +111,12 @@ class Pipeline:
 
     def poll(self, now_s: float) -> list[ForecastSet]:
         """Close cycles whose rest does not come, and say so when nothing comes any more."""
-        if now_s < self._control_due_s:
+        if abs(now_s - self._controlled_s) < _CONTROL_S:
             return _NOTHING
-        self._control_due_s = now_s + _CONTROL_S
+        self._controlled_s = now_s
         made = self._handle_all(self.decoder.poll(now_s), now_s)
         if now_s >= self._silent_due_s and not made:
-            self._silent_due_s += self._predictor.contract.dt_s
+            self._silent_due_s = now_s + self._predictor.contract.dt_s
             made.append(self._silence(now_s))
         return made
 
@@ -142,7 +143,7 @@ class Pipeline:
         self.tracks.update(detections, ego, self._profile.sensor(detections.sensor).mount)
         self._silent_due_s = now_s + SILENT_PERIODS * self._predictor.contract.dt_s
         since_s = timestamp_s - self._predicted_s
-        if 0.0 <= since_s < MIN_PERIOD * self._predictor.contract.dt_s:
+        if -_MAX_CLOCK_STEP_S <= since_s < MIN_PERIOD * self._predictor.contract.dt_s:
             self.counters.skipped += 1
             return None
         self._predicted_s = timestamp_s

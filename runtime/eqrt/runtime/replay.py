@@ -29,17 +29,23 @@ from eqrt.runtime.serve import add_pipeline_arguments, load_pipeline
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt replay`."""
-    parser.add_argument("log", type=Path, help="candump .log, .asc, .blf or .trc, also with .gz")
+    parser.add_argument(
+        "log", type=Path, metavar="LOG", help="candump .log, .asc, .blf or .trc, also with .gz"
+    )
     add_pipeline_arguments(parser)
     parser.add_argument(
         "--can",
         action="append",
         default=[],
-        metavar="ROLE=NAME",
-        help="which of the log's channels is which of the profile's buses; else any",
+        metavar="[ROLE=]NAME",
+        help="read only the log's channel NAME; with ROLE= for one of the profile's buses "
+        "(repeatable; default: all channels for everything)",
     )
     parser.add_argument(
-        "--out", required=True, metavar="FILE", help="JSON lines; - = standard output"
+        "--out",
+        required=True,
+        metavar="FILE",
+        help="where to write a JSON line per prediction (docs/output.md); - = standard output",
     )
 
 
@@ -48,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     log = read_log(args.log)
     profile = load_profile(args.profile)
     channels = parse_channels(args.can, profile.roles)
-    pipeline = load_pipeline(args, profile, channels, clock=None)
+    pipeline = load_pipeline(args, profile, channels or None, clock=None)
     started_s = time.perf_counter()
     with _output(args.out) as out:
         for forecast in replay(pipeline, log):
@@ -83,12 +89,18 @@ def _output(name: str) -> Iterator[BinaryIO]:
         yield sys.stdout.buffer
         return
     path = Path(name)
-    partial = path.with_name(path.name + ".part")
+    in_place = path.exists() and not path.is_file()  # a device or a pipe
+    written = path if in_place else path.parent / f"{path.name}.part"
     try:
-        with partial.open("wb") as stream:
+        with written.open("wb") as stream:
             yield stream
-        os.replace(partial, path)
+        if not in_place:
+            os.replace(written, path)
     except OSError as error:
-        raise UsageError(f"cannot write {error.filename or path}: {error.strerror}") from error
+        raise UsageError(
+            f"cannot write {path} ({error.strerror}); give --out a file in a folder that exists"
+        ) from error
     finally:
-        partial.unlink(missing_ok=True)
+        if not in_place:
+            with contextlib.suppress(OSError):
+                written.unlink(missing_ok=True)

@@ -7,17 +7,16 @@ import contextlib
 import gc
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
 import can
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.bus.buses import open_bus
+from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.decoding.profile import Profile, builtin_profiles, load_profile
-from eqrt.runtime.output.datagrams import DatagramPublisher
+from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS, DatagramPublisher
 from eqrt.runtime.output.publish_can import CanPublisher
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
@@ -36,20 +35,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         action="append",
         metavar="[ROLE=]CHANNEL",
-        help="where the sensor is; with ROLE= the channel of one of the profile's buses",
+        help="the channel to listen on, such as can0; with ROLE= that of one of the profile's "
+        "buses, such as radar=can1 (repeatable)",
     )
-    parser.add_argument("--can-interface", metavar="IF", help="python-can's name; else socketcan")
+    parser.add_argument(
+        "--can-interface",
+        metavar="IF",
+        help=f"python-can's name of the kind of adapter (default: socketcan; {LOCAL} needs no CAN "
+        "hardware)",
+    )
+    parser.add_argument(
+        "--fd",
+        action=argparse.BooleanOptionalAction,
+        help="open channels for CAN FD, or not: then predictions are sent as classic messages "
+        "(default: CAN FD if the channel can)",
+    )
     parser.add_argument(
         "--out-can",
         metavar="CHANNEL",
-        help=f"where predictions go: the first --can unless given; {NO_CHANNEL!r} = not on CAN",
+        help="the channel to send predictions on (default: the first --can); "
+        f"{NO_CHANNEL!r} = not on CAN",
     )
     parser.add_argument(
         "--datagrams",
         action="append",
         default=[],
         metavar="HOST:PORT",
-        help="also send predictions as UDP datagrams to a viewer or recorder (repeatable)",
+        help="send predictions as UDP datagrams too, to a viewer or recorder, such as "
+        f"{DEFAULT_ADDRESS} (repeatable)",
     )
     parser.add_argument("--quiet", action="store_true", help="no status line every second")
 
@@ -60,33 +73,41 @@ def add_pipeline_arguments(parser: argparse.ArgumentParser) -> None:
         "--profile",
         required=True,
         metavar="NAME|FILE",
-        help=f"how messages are read: {', '.join(builtin_profiles())}, or a TOML file",
+        help=f"which sensor sends: {', '.join(builtin_profiles())}, or a profile of your own, "
+        "a .toml file (docs/profiles.md)",
     )
     parser.add_argument(
         "--model",
         type=Path,
         default=DEFAULT_ARTIFACT,
         metavar="FOLDER",
-        help="a model artifact (default: the one that comes with eqrt)",
+        help="the predictor, as `eqrt export` writes it (default: the one that comes with eqrt)",
     )
-    parser.add_argument("--tile", type=Path, metavar="FILE", help="map tile; else without a map")
     parser.add_argument(
-        "--stationary", action="store_true", help="the sensor stands still, and no message says so"
+        "--tile",
+        type=Path,
+        metavar="FILE",
+        help="the map around, from `eqrt tile build` (default: predict without a map)",
+    )
+    parser.add_argument(
+        "--stationary",
+        action="store_true",
+        help="the sensor stands still: predict although no message tells its motion",
     )
 
 
 def load_pipeline(
     args: argparse.Namespace,
     profile: Profile,
-    channels: dict[str, str],
+    channels: dict[str, str] | None,
     clock: Callable[[], float] | None,
 ) -> Pipeline:
-    """The pipeline that `add_pipeline_arguments` describes."""
+    """The pipeline that `add_pipeline_arguments` describes; the others are as for Pipeline."""
     return Pipeline(
         profile,
         Predictor.load(args.model),
         load_tile(args.tile) if args.tile else None,
-        channels=channels if len(set(channels.values())) > 1 else None,
+        channels=channels,
         stationary=args.stationary,
         clock=clock,
     )
@@ -99,7 +120,8 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         should_stop = stack.enter_context(until_told_to_stop())
         buses = _open_buses(args, profile, sorted(set(channels.values())), stack)
-        pipeline = load_pipeline(args, profile, channels, clock=time.monotonic)
+        several = channels if len(buses) > 1 else None
+        pipeline = load_pipeline(args, profile, several, clock=time.monotonic)
         publishers = _publishers(args, buses, stack)
         receiver = _receiver(buses, stack)
         report = _say_nothing if args.quiet else _say
@@ -116,7 +138,7 @@ def _open_buses(
 ) -> dict[str, can.BusABC]:
     return {
         channel: stack.enter_context(
-            open_bus(channel, args.can_interface, receive_ids=profile.arbitration_ids)
+            open_bus(channel, args.can_interface, fd=args.fd, receive_ids=profile.arbitration_ids)
         )
         for channel in channels
     }
@@ -133,17 +155,23 @@ class Merged:
     """Several buses read as one, each by a thread of python-can's."""
 
     def __init__(self, buses: Mapping[str, can.BusABC]) -> None:
-        self._messages: SimpleQueue[can.Message] = SimpleQueue()
+        self._heard: SimpleQueue[can.Message | Exception] = SimpleQueue()
         self._notifiers = [
-            can.Notifier(bus, [partial(self._put, channel)]) for channel, bus in buses.items()
+            can.Notifier(bus, [_Ear(channel, self._heard)]) for channel, bus in buses.items()
         ]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next message of any bus; its channel is the name that the bus was opened by."""
+        """The next message of any bus; its channel is the name that the bus was opened by.
+
+        Raises can.CanOperationError if a bus can no longer be read.
+        """
         try:
-            return self._messages.get(timeout=timeout)
+            heard = self._heard.get(timeout=timeout)
         except Empty:
             return None
+        if isinstance(heard, Exception):
+            raise can.CanOperationError(str(heard)) from heard
+        return heard
 
     def __enter__(self) -> Merged:
         return self
@@ -152,9 +180,20 @@ class Merged:
         for notifier in self._notifiers:
             notifier.stop()
 
-    def _put(self, channel: str, message: can.Message) -> None:
-        message.channel = channel  # some interfaces keep the sender's name for it
-        self._messages.put(message)
+
+class _Ear(can.Listener):
+    """Puts what a bus's thread hears where the main thread reads."""
+
+    def __init__(self, channel: str, heard: SimpleQueue[can.Message | Exception]) -> None:
+        self._channel = channel
+        self._heard = heard
+
+    def on_message_received(self, msg: can.Message) -> None:
+        msg.channel = self._channel  # some interfaces keep the sender's name for it
+        self._heard.put(msg)
+
+    def on_error(self, exc: Exception) -> None:
+        self._heard.put(exc)
 
 
 def _publishers(
@@ -162,10 +201,12 @@ def _publishers(
 ) -> list[Publisher]:
     publishers: list[Publisher] = []
     if args.out_can != NO_CHANNEL:
-        channel = args.out_can or next(iter(buses))
+        channel = args.out_can or args.can[0].rpartition("=")[2]
         bus = buses.get(channel)
         if bus is None:
-            bus = stack.enter_context(open_bus(channel, args.can_interface, receive_ids=[]))
+            bus = stack.enter_context(
+                open_bus(channel, args.can_interface, fd=args.fd, receive_ids=[])
+            )
         publishers.append(CanPublisher(bus))
     elif not args.datagrams:
         raise UsageError("--out-can none and no --datagrams: the predictions would go nowhere")

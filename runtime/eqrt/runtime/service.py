@@ -11,6 +11,7 @@ from typing import Protocol
 import can
 import numpy as np
 
+from eqrt.core.errors import BusError
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.pipeline import Pipeline
 
@@ -70,14 +71,12 @@ class Service:
         self._report = report
         self._clock = ArrivalClock()
         self._second = Report()
-        self.messages = 0
-        """Received so far."""
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Serve until told to stop."""
+        """Serve until told to stop. Raises BusError if the bus goes away."""
         report_due_s = time.monotonic() + _REPORT_S
         while not should_stop():
-            message = self._receiver.recv(_NAP_S)
+            message = self._receive()
             stamp_s = None if message is None else message.timestamp
             now_s = self._clock.now_s(time.monotonic(), stamp_s, time.time())
             self._publish(self._pipeline.poll(now_s), now_s)
@@ -86,6 +85,14 @@ class Service:
                 self._publish(self._pipeline.feed(message, now_s), now_s)
             if (monotonic_s := time.monotonic()) >= report_due_s:
                 report_due_s = self._say(monotonic_s, report_due_s)
+
+    def _receive(self) -> can.Message | None:
+        try:
+            return self._receiver.recv(_NAP_S)
+        except (can.CanError, OSError) as error:
+            raise BusError(
+                f"the CAN channel can no longer be read ({error}); when it is back, start again"
+            ) from error
 
     def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
         for forecast in forecasts:
@@ -98,7 +105,6 @@ class Service:
     def _say(self, now_s: float, due_s: float) -> float:
         """Report the second that has passed; returns when the next one ends."""
         self._report(self._second.line(_REPORT_S + now_s - due_s))
-        self.messages += self._second.messages
         self._second = Report()
         return max(due_s + _REPORT_S, now_s)
 

@@ -1,7 +1,8 @@
 """Make clean recordings look like what a sensor in a car sees.
 
 The network is equivariant, so nothing is rotated or shifted here. What it must learn is that tracks
-begin late, have holes, jitter, that neighbours are hidden and that a map may be missing.
+begin late, have holes, jitter, that neighbours are hidden and that a map may be missing; and that
+there are parked cars, and faster and slower roads than the recorded ones.
 """
 
 from __future__ import annotations
@@ -18,6 +19,14 @@ Batch = dict[str, Tensor]
 class AugmentConfig:
     """Probabilities per window unless said otherwise."""
 
+    scaled: float
+    """The whole scene, lanes and future too, is made larger or smaller: other speeds."""
+    max_scale: float
+    """The largest factor; the smallest is its inverse."""
+    parked: float
+    """The target has always stood where it is, and stays."""
+    standing: float
+    """So has everybody: a queue."""
     short_history: float
     """The target and its neighbours were first seen only some steps ago."""
     missing_step: float
@@ -36,12 +45,15 @@ class AugmentConfig:
 
 
 def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> Batch:
-    """A new batch; the target's last step and the future stay as they are."""
+    """A new batch; the target's last step stays where it is, up to noise."""
 
     def chance(probability: float, *shape: int) -> Tensor:
         return torch.rand(shape, generator=generator) < probability
 
-    windows, agents, steps = batch["history_valid"].shape
+    windows = len(batch["future"])
+    batch = _parked(batch, chance(config.parked, windows), chance(config.standing, windows))
+    batch = _scaled(batch, _scales(windows, config, generator))
+    _, agents, steps = batch["history_valid"].shape
     lines = batch["centerlines_valid"].shape[1]
     first = torch.randint(0, steps - 1, (windows, 1, 1), generator=generator)
     late = chance(config.short_history, windows, 1, 1) & (torch.arange(steps) < first)
@@ -57,6 +69,38 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
         "heading": _heading(batch["heading"], config, generator),
         "centerlines_valid": batch["centerlines_valid"] & ~lost,
     }
+
+
+def _parked(batch: Batch, parked: Tensor, standing: Tensor) -> Batch:
+    """The targets `parked` (B,), or all agents of the scenes `standing` (B,), have never moved.
+
+    Agents that are not seen now keep their past: where they are now is not known.
+    """
+    last = batch["history"][:, :, -1:]  # (B, N, 1, 2)
+    still = standing[:, None].repeat(1, last.shape[1])
+    still[:, 0] |= parked
+    still = (still & batch["history_valid"][:, :, -1])[..., None, None]  # (B, N, 1, 1)
+    future = torch.where(still[:, 0], last[:, 0], batch["future"])
+    return batch | {"history": torch.where(still, last, batch["history"]), "future": future}
+
+
+def _scales(windows: int, config: AugmentConfig, generator: torch.Generator) -> Tensor:
+    """(B,) factors, even in their logarithm; 1 for those that stay as they are."""
+    power = 2.0 * torch.rand(windows, generator=generator) - 1.0
+    chosen = torch.rand(windows, generator=generator) < config.scaled
+    return torch.where(chosen, config.max_scale**power, 1.0)
+
+
+def _scaled(batch: Batch, scale: Tensor) -> Batch:
+    """Everything farther from, or nearer to, the target's last place by `scale` (B,)."""
+    here = batch["history"][:, 0, -1]  # (B, 2)
+
+    def grown(points: Tensor) -> Tensor:
+        shape = (-1, *[1] * (points.dim() - 2))
+        center = here.view(*shape, 2)
+        return center + (points - center) * scale.view(*shape, 1)
+
+    return batch | {name: grown(batch[name]) for name in ("history", "centerlines", "future")}
 
 
 def _noise(history: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:

@@ -127,7 +127,7 @@ class FeatureLearning(nn.Module):
     messages of all interaction categories come from one stacked matrix.
     """
 
-    def __init__(self, channels: int, width: int, categories: int) -> None:
+    def __init__(self, channels: int, width: int, categories: int, dropout: float) -> None:
         super().__init__()
         self.categories = categories
         self.inner = nn.Linear(width, channels)
@@ -138,6 +138,7 @@ class FeatureLearning(nn.Module):
         self.nonlinearity = VectorNonlinearity(channels)
         self.step = nn.Parameter(torch.full((channels,), 0.1))  # or vectors grow with every layer
         self.update = mlp([2 * width + 2 * channels, width, width])
+        self.dropout = nn.Dropout(dropout)
         self.norm = nn.LayerNorm(width)
 
     def forward(self, geometric: Tensor, pattern: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
@@ -152,7 +153,7 @@ class FeatureLearning(nn.Module):
         scale = 1.0 + self.inner(pattern).unsqueeze(-2)  # (B, N, 1, C)
         geometric = geometric + self.step * self.nonlinearity(scale * geometric + aggregated)
         seen = self.update(self._invariants(geometric, pattern, message.sum(2) / count))
-        return geometric, self.norm(pattern + seen)
+        return geometric, self.norm(pattern + self.dropout(seen))
 
     def _messages(self, distance: Tensor, pattern: Tensor, weights: Tensor) -> Tensor:
         """Messages (B, N, N, D) from agent j to i, the categories already mixed."""

@@ -71,6 +71,8 @@ class ModelConfig:
     heads: int
     pointers: int
     """Lane vectors handed from the map to the target."""
+    dropout: float
+    """Share of pattern updates dropped while training."""
 
     def contract(self, name: str, version: str) -> ModelContract:
         """The contract an artifact of this network promises."""
@@ -94,11 +96,12 @@ class EquivariantPredictor(nn.Module):
         super().__init__()
         self.config = config
         self.motion = MotionInit(config)
+        self.dropout = nn.Dropout(config.dropout)
         self.map = PointTransformer(config.token_width, config.heads, config.pointers, config.width)
         self.fuse = nn.Linear(config.channels + config.pointers, config.channels, bias=False)
         self.interaction = InteractionReasoning(config.channels, config.width, config.categories)
         self.layers = nn.ModuleList(
-            FeatureLearning(config.channels, config.width, config.categories)
+            FeatureLearning(config.channels, config.width, config.categories, config.dropout)
             for _ in range(config.layers)
         )
         self.decoder = Decoder(config)
@@ -158,7 +161,7 @@ class EquivariantPredictor(nn.Module):
         target = torch.cat([motion.geometric[:, 0], lanes], -1)  # (B, 2, C + pointers) turns
         geometric = torch.cat([self.fuse(target).unsqueeze(1), motion.geometric[:, 1:]], 1)
         pattern = torch.cat(
-            [(motion.pattern[:, 0] + feature).unsqueeze(1), motion.pattern[:, 1:]], 1
+            [(motion.pattern[:, 0] + self.dropout(feature)).unsqueeze(1), motion.pattern[:, 1:]], 1
         )
         return geometric, pattern
 

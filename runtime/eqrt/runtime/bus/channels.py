@@ -10,7 +10,8 @@ from eqrt.core.errors import UsageError
 def parse_channels(options: Sequence[str], roles: Sequence[str]) -> dict[str, str]:
     """Role -> channel, from options like `vcan0` (every role) or `radar=can1`.
 
-    Raises UsageError for a role that the profile does not have, or one left without a channel.
+    Without options, no role has a channel. Raises UsageError for a role that the profile does not
+    have, that is given twice, or that is left without a channel.
     """
     channels: dict[str, str] = {}
     everywhere: str | None = None
@@ -29,6 +30,8 @@ def parse_channels(options: Sequence[str], roles: Sequence[str]) -> dict[str, st
             raise UsageError(
                 f"--can {option}: the profile has no bus {role!r}, only {', '.join(roles)}"
             )
+        elif role in channels:
+            raise UsageError(f"--can {option}: the bus {role!r} already is {channels[role]!r}")
         else:
             channels[role] = channel
     if everywhere is not None:

@@ -14,6 +14,8 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eqrt.core.errors import EqrtError
+from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.demo.picture import render
 from eqrt.runtime.demo.score import Scoreboard
@@ -73,18 +75,26 @@ PARTS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt demo`."""
     parser.add_argument(
-        "--part", choices=[part.name for part in PARTS], help="only this one (default: both)"
+        "--part", choices=[part.name for part in PARTS], help="show only this one (default: both)"
     )
     parser.add_argument(
-        "--seconds", type=float, help="stop each part after that long (default: play all of it)"
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="stop each part after that long; scores begin after 4 s (default: play all of it)",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path(), metavar="FOLDER", help="for the pictures (default: .)"
+        "--out",
+        type=Path,
+        default=Path(),
+        metavar="FOLDER",
+        help="where to write a picture of each part, eqrt-demo-PART.svg (default: here)",
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Play, predict, score and draw each part."""
+    _make_folder(args.out)
     parts = [part for part in PARTS if args.part in (None, part.name)]
     for index, part in enumerate(parts):
         print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
@@ -103,8 +113,6 @@ class PartResult:
     board: Scoreboard
     moment: BestMoment
     latencies_s: list[float]
-    first_s: float | None
-    """From starting the player to the first prediction."""
 
     def print_summary(self) -> None:
         """The figures, beside constant velocity's."""
@@ -117,21 +125,20 @@ class PartResult:
         for label, table in (("eqrt", ours), ("constant velocity", baseline)):
             print(f"  {label:18}" + "".join(f"{value:9.2f}" for value in table.values()))
         p50, p99 = 1e3 * np.quantile(self.latencies_s, [0.5, 0.99])
-        print(f"  last measurement to prediction: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
+        print(f"  time to predict all objects of a cycle: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
 
     def write_picture(self, path: Path) -> Path | None:
         """One moment of the part as SVG, or None if none could be scored."""
         moment = self.moment.picture(load_tile(self.part.tile) if self.part.tile else None)
         if moment is None:
             return None
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(render(moment), encoding="utf-8")
         return path.resolve()
 
 
 def play_part(part: Part, seconds: float | None) -> PartResult:
     """Run one part to its end, a line a second."""
-    result = PartResult(part, Scoreboard(), BestMoment(), [], None)
+    result = PartResult(part, Scoreboard(), BestMoment(), [])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(0.2)
@@ -141,18 +148,29 @@ def play_part(part: Part, seconds: float | None) -> PartResult:
             started_s = time.monotonic()
             line_due_s = started_s + 1.0
             for forecast in _forecasts(receiver, player, seconds):
-                _take(result, forecast, started_s)
+                _take(result, forecast)
                 if time.monotonic() >= line_due_s:
                     print(_line(result, forecast, time.monotonic() - started_s), flush=True)
                     line_due_s += 1.0
     return result
 
 
-def _take(result: PartResult, forecast: ForecastSet, started_s: float) -> None:
+def _make_folder(folder: Path) -> None:
+    """Now, because a minute later the pictures would be lost."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UsageError(
+            f"cannot write pictures to {folder.resolve()} ({error.strerror}); "
+            "give --out a folder that can be written"
+        ) from error
+
+
+def _take(result: PartResult, forecast: ForecastSet) -> None:
     if forecast.num_targets:
         result.latencies_s.append(forecast.compute_s)
-        if result.first_s is None:
-            result.first_s = time.monotonic() - started_s
     result.moment.add(forecast, result.board.add(forecast))
 
 
@@ -186,11 +204,22 @@ def _service(part: Part, channel: str, address: str) -> Iterator[None]:
     """`eqrt serve` in a process of its own, from when it listens until the end of the block."""
     command = [*_eqrt("serve"), "--can", channel, "--can-interface", LOCAL, *part.serve]
     with _process([*command, "--datagrams", address, "--out-can", channel, "--quiet"]) as service:
-        assert service.stdout is not None
-        ready = service.stdout.readline()
-        if not ready.startswith("eqrt serve:"):
-            raise EqrtError(f"the service did not start: {ready.strip() or 'it said nothing'}")
+        _wait_until_ready(service)
         yield
+
+
+def _wait_until_ready(service: subprocess.Popen[str]) -> None:
+    assert service.stdout is not None
+    too_late = threading.Timer(_START_S, service.kill)
+    too_late.start()
+    said = []
+    for line in service.stdout:
+        if line.startswith("eqrt serve:"):
+            too_late.cancel()
+            return
+        said.append(line.strip())
+    too_late.cancel()
+    raise EqrtError(f"the service did not start: {said[-1] if said else 'it said nothing'}")
 
 
 @contextlib.contextmanager

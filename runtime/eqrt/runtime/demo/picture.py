@@ -43,7 +43,8 @@ class Moment:
 
 def render(moment: Moment) -> str:
     """The SVG text. Raises ValueError if there is nothing to draw."""
-    view = _View.around([*moment.agents, *(line for ls in moment.lines.values() for line in ls)])
+    shown = [*moment.agents, *(line for lines in moment.lines.values() for line in lines)]
+    view = _View.around(shown if moment.ego is None else [*shown, moment.ego])
     body = [_lane(view, lane) for lane in moment.lanes]
     for name, (color, width, dash, _) in _STYLES.items():
         body += [_polyline(view, line, color, width, dash) for line in moment.lines.get(name, [])]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,9 @@ DEFAULT_ARTIFACT = Path(__file__).parent / "models" / "eqrt-ngsim"
 SELF_CHECK_M = 1e-3
 """A test vector must come back within a millimetre."""
 
+TensorSpecs = Mapping[str, tuple[str, tuple[int | str, ...]]]
+"""Tensor name -> (element type, shape), as `ModelContract` gives them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
@@ -46,6 +50,7 @@ class Predictor:
     def __init__(self, session: onnxruntime.InferenceSession, contract: ModelContract, sha256: str):
         self._session = session
         self.contract = contract
+        self._outputs = list(contract.outputs)
         self.model_id = sha256[:8]
         """First digits of the model file's SHA-256: which model made a prediction."""
 
@@ -72,18 +77,19 @@ class Predictor:
 
     def predict(self, scene: Scene) -> Prediction:
         """One run for all targets of the scene."""
-        trajectories, probabilities = self._session.run(None, scene.inputs())
+        trajectories, probabilities = self._session.run(self._outputs, scene.inputs())
         return Prediction(trajectories + scene.origin, probabilities)
 
     def _self_check(self, folder: Path) -> None:
         vectors = sorted(folder.glob("test_data_set_*"))
         if not vectors:
             raise ContractError(f"{folder}: no test_data_set_*; export the model again")
-        feed = _tensors(vectors[0], "input", list(self.contract.inputs))
-        expected = _tensors(vectors[0], "output", list(self.contract.outputs))
-        found = self._session.run(None, feed)
+        feed = _tensors(vectors[0], "input", self.contract.inputs)
+        expected = _tensors(vectors[0], "output", self.contract.outputs)
+        found = self._session.run(self._outputs, feed)
         for name, value in zip(expected, found, strict=True):
-            error = float(np.abs(value - expected[name]).max())
+            same_shape = value.shape == expected[name].shape
+            error = float(np.abs(value - expected[name]).max()) if same_shape else np.inf
             if not error <= SELF_CHECK_M:
                 raise ContractError(
                     f"{vectors[0]}: the model's {name} differ by {error:.4g} from the stored ones "
@@ -95,7 +101,7 @@ def _read_checked(folder: Path) -> bytes:
     """The bytes of `model.onnx`, after comparing them with SHA256SUMS."""
     try:
         content = (folder / "model.onnx").read_bytes()
-        sums = (folder / "SHA256SUMS").read_text(encoding="utf-8")
+        sums = (folder / "SHA256SUMS").read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise ContractError(
             f"{error.filename}: {error.strerror}; a model is a folder with model.onnx and "
@@ -152,5 +158,16 @@ def _check_tensors(session: Any, contract: ModelContract, folder: Path) -> None:
         )
 
 
-def _tensors(folder: Path, side: str, names: list[str]) -> dict[str, NDArray[Any]]:
-    return {name: read_tensor(folder / f"{side}_{i}.pb") for i, name in enumerate(names)}
+def _tensors(folder: Path, side: str, specs: TensorSpecs) -> dict[str, NDArray[Any]]:
+    """A stored test vector's tensors, as the contract wants them, all of one batch."""
+    tensors: dict[str, NDArray[Any]] = {}
+    for i, (name, (kind, shape)) in enumerate(specs.items()):
+        path = folder / f"{side}_{i}.pb"
+        tensors[name] = tensor = read_tensor(path)
+        batch = len(next(iter(tensors.values()))) if tensor.ndim else 0
+        if tensor.dtype != kind or tensor.shape != (batch, *shape[1:]) or not batch:
+            raise ContractError(
+                f"{path}: {name} is {tensor.dtype} {list(tensor.shape)}, the contract says {kind} "
+                f"{list(shape)}; export the model again"
+            )
+    return tensors

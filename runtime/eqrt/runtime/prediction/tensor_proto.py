@@ -40,6 +40,8 @@ def parse_tensor(content: bytes) -> NDArray[Any]:
             data_type = value
         elif field == _RAW_DATA and isinstance(value, bytes):
             raw = value
+    if any(size > len(raw) for size in dims):
+        raise ValueError(f"{len(raw)} bytes for the shape {dims}")
     return np.frombuffer(raw, _DTYPES[data_type]).reshape(dims)
 
 
@@ -79,4 +81,4 @@ def _varint(content: bytes, at: int) -> tuple[int, int]:
             return value, at
         shift += 7
         if shift > 63:
-            raise ValueError("varint longer than 64 bits")
+            raise ValueError("a number longer than 64 bits")
