@@ -23,7 +23,8 @@ from eqrt.export.to_onnx import FORBIDDEN_OPS, IR_VERSION, OPSET, to_onnx
 from eqrt.export.vectors import move, named_scenes, nan_where_invalid
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.training.checkpoint import Card, load_checkpoint, save_checkpoint
-from eqrt.training.model import EquivariantPredictor, ModelConfig
+from eqrt.training.config import ModelConfig
+from eqrt.training.model import EquivariantPredictor
 from poses import random_pose
 
 CONFIG = ModelConfig(

@@ -22,8 +22,9 @@ from eqrt.export.vectors import (
     without_neighbours,
 )
 from eqrt.training.canonical import canonical_from_tile
+from eqrt.training.config import ModelConfig
 from eqrt.training.losses import best_mode_loss
-from eqrt.training.model import EquivariantPredictor, ModelConfig
+from eqrt.training.model import EquivariantPredictor
 from poses import random_pose
 
 CONFIG = ModelConfig(

@@ -29,6 +29,7 @@ from eqrt.runtime.serve import add_pipeline_arguments, load_pipeline
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt replay`."""
+    parser.epilog = "example: eqrt replay drive.log --profile ars408 --out predictions.jsonl"
     parser.add_argument(
         "log", type=Path, metavar="LOG", help="candump .log, .asc, .blf or .trc, also with .gz"
     )

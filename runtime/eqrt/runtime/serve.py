@@ -29,6 +29,7 @@ NO_CHANNEL = "none"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt serve`."""
+    parser.epilog = "example: eqrt serve --can can0 --profile ars408 --tile town.tile"
     add_pipeline_arguments(parser)
     parser.add_argument(
         "--can",

@@ -13,7 +13,8 @@ import safetensors.torch
 import torch
 
 from eqrt.core.errors import EqrtError
-from eqrt.training.model import EquivariantPredictor, ModelConfig
+from eqrt.training.config import ModelConfig
+from eqrt.training.model import EquivariantPredictor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

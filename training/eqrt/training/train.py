@@ -22,10 +22,11 @@ from torch.optim import AdamW
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.training.augment import AugmentConfig, augment
 from eqrt.training.checkpoint import Card, save_checkpoint
+from eqrt.training.config import ModelConfig
 from eqrt.training.data import Windows, batches, load_windows, scenario_files, scenario_name
 from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity
 from eqrt.training.losses import best_mode_loss
-from eqrt.training.model import EquivariantPredictor, ModelConfig
+from eqrt.training.model import EquivariantPredictor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

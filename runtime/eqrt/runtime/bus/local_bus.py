@@ -13,6 +13,7 @@ import contextlib
 import hashlib
 import socket
 import struct
+import sys
 import time
 from typing import Any
 
@@ -25,6 +26,8 @@ _BITRATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04  # in the CAN FD flags, as
 _LOOPBACK = "127.0.0.1"
 _RECEIVE_BYTES = 4 << 20  # asked for; Linux grants 200 kB where nobody has raised the limit
 _IP_MULTICAST_ALL = 49  # Linux: if not cleared, groups that others have joined come in as well
+_SO_TIMESTAMPNS = 35  # Linux: the kernel says when a datagram came, however late it is read
+_TIMESPEC = struct.Struct("@ll")  # s, ns
 
 
 class LocalBus(can.BusABC):
@@ -65,6 +68,8 @@ class LocalBus(can.BusABC):
         self._receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
         with contextlib.suppress(OSError):  # another system than Linux
             self._receiver.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        if sys.platform == "linux":
+            self._receiver.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._receiver.bind(self._destination)
         self._receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + loopback)
 
@@ -80,18 +85,32 @@ class LocalBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
             self._receiver.settimeout(timeout)
-            datagram, sender = self._receiver.recvfrom(_HEADER.size + 64)
+            datagram, arrived_s, sender = self._read()
         except (TimeoutError, BlockingIOError):
             return None, False
         except OSError as error:
             raise can.CanOperationError(f"cannot receive: {error.strerror}", error.errno) from error
         if sender == self._address or datagram[:8] != self._digest:
             return None, False
-        message = _unpack(datagram, str(self.channel))
+        message = _unpack(datagram, str(self.channel), arrived_s)
         is_ours = message is not None and (
             not message.is_fd or self._can_protocol is can.CanProtocol.CAN_FD
         )
         return (message if is_ours else None), False
+
+    def _read(self) -> tuple[bytes, float, Any]:
+        """A datagram, the wall-clock time at which it came, and who sent it."""
+        if sys.platform != "linux":
+            datagram, sender = self._receiver.recvfrom(_HEADER.size + 64)
+            return datagram, time.time(), sender
+        datagram, told, _, sender = self._receiver.recvmsg(
+            _HEADER.size + 64, socket.CMSG_SPACE(_TIMESPEC.size)
+        )
+        for _, kind, stamp in told:
+            if kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+                return datagram, seconds + 1e-9 * nanoseconds, sender
+        return datagram, time.time(), sender
 
     def fileno(self) -> int:
         """For select: readable when a message may have come."""
@@ -124,13 +143,13 @@ def _pack(digest: bytes, message: can.Message) -> bytes:
     return _HEADER.pack(digest, flagged_id, message.dlc, flags) + message.data
 
 
-def _unpack(datagram: bytes, channel: str) -> can.Message | None:
+def _unpack(datagram: bytes, channel: str, arrived_s: float) -> can.Message | None:
     """The message of a datagram; None if it is not of this format."""
     if len(datagram) < _HEADER.size:
         return None
     _, flagged_id, length, flags = _HEADER.unpack_from(datagram)
     return can.Message(
-        timestamp=time.time(),
+        timestamp=arrived_s,
         channel=channel,
         arbitration_id=flagged_id & 0x1FFFFFFF,
         is_extended_id=bool(flagged_id & _EXTENDED),
