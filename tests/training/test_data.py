@@ -30,6 +30,9 @@ NOTHING = AugmentConfig(
     max_scale=1.0,
     parked=0.0,
     standing=0.0,
+    clutter=0.0,
+    ghost=0.0,
+    alone=0.0,
     short_history=0.0,
     missing_step=0.0,
     hidden_neighbour=0.0,
@@ -172,6 +175,28 @@ def test_in_standing_traffic_nobody_moves(windows: Windows) -> None:
     still = (batch["history"] - batch["history"][:, :, -1:]).abs().amax(dim=(2, 3))
     assert float(still[seen].max()) == 0.0
     torch.testing.assert_close(batch["future"], before["history"][:, 0, -1:].expand(-1, 30, -1))
+
+
+def test_clutter_is_beside_the_target_and_never_the_target(windows: Windows) -> None:
+    batch, before = augmented(windows, clutter=1.0), windows.tensors()
+    torch.testing.assert_close(batch["history"][:, 0], before["history"][:, 0])
+    seen = before["history_valid"][:, 1:, -1]
+    moved = (batch["history"][:, 1:] - batch["history"][:, 1:, -1:]).abs().amax(dim=(2, 3))
+    assert float(moved[seen].max()) == 0.0
+
+
+def test_a_ghost_moves_with_the_target(windows: Windows) -> None:
+    batch, before = augmented(windows, ghost=1.0), windows.tensors()
+    offset = batch["history"] - before["history"][:, :1]
+    torch.testing.assert_close(offset, offset[:, :, :1].expand_as(offset), atol=1e-4, rtol=0)
+    assert 0.5 < float(offset[:, 1:].norm(dim=-1).median()) < 3.0
+    assert torch.equal(batch["history_valid"], before["history_valid"][:, :1].expand(-1, 8, -1))
+
+
+def test_a_target_left_alone_has_no_neighbours(windows: Windows) -> None:
+    batch = augmented(windows, alone=1.0)
+    assert not batch["history_valid"][:, 1:].any()
+    assert batch["history_valid"][:, 0, -1].all()
 
 
 def test_noise_touches_histories_and_never_the_truth(windows: Windows) -> None:

@@ -116,7 +116,8 @@ class Pipeline:
         self._controlled_s = now_s
         made = self._handle_all(self.decoder.poll(now_s), now_s)
         if now_s >= self._silent_due_s and not made:
-            self._silent_due_s = now_s + self._predictor.contract.dt_s
+            dt_s = self._predictor.contract.dt_s
+            self._silent_due_s = now_s + dt_s - (now_s - self._silent_due_s) % dt_s
             made.append(self._silence(now_s))
         return made
 

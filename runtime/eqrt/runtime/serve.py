@@ -25,6 +25,7 @@ from eqrt.runtime.service import Publisher, Receiver, Service
 from eqrt.runtime.signals import until_told_to_stop
 
 NO_CHANNEL = "none"
+_NOTICE_END_S = 0.1  # how often a thread of python-can looks whether it is to end
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -158,7 +159,8 @@ class Merged:
     def __init__(self, buses: Mapping[str, can.BusABC]) -> None:
         self._heard: SimpleQueue[can.Message | Exception] = SimpleQueue()
         self._notifiers = [
-            can.Notifier(bus, [_Ear(channel, self._heard)]) for channel, bus in buses.items()
+            can.Notifier(bus, [_Ear(channel, self._heard)], timeout=_NOTICE_END_S)
+            for channel, bus in buses.items()
         ]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:

@@ -14,6 +14,9 @@ from torch import Tensor
 
 Batch = dict[str, Tensor]
 
+GHOST_M = 1.5
+"""A radar sees a vehicle at its corners, wheels and through its underbody."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AugmentConfig:
@@ -27,6 +30,12 @@ class AugmentConfig:
     """The target has always stood where it is, and stays."""
     standing: float
     """So has everybody: a queue."""
+    clutter: float
+    """Per neighbour: it is a thing beside the road that has never moved."""
+    ghost: float
+    """Per neighbour: it is a second reflection of the target, within some metres."""
+    alone: float
+    """Every neighbour is hidden."""
     short_history: float
     """The target and its neighbours were first seen only some steps ago."""
     missing_step: float
@@ -51,14 +60,19 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
         return torch.rand(shape, generator=generator) < probability
 
     windows = len(batch["future"])
-    batch = _parked(batch, chance(config.parked, windows), chance(config.standing, windows))
+    agents = batch["history"].shape[1]
+    still = chance(config.clutter, windows, agents)
+    still[:, 0] = chance(config.parked, windows)
+    batch = _stood(batch, still | chance(config.standing, windows, 1))
+    batch = _ghosts(batch, chance(config.ghost, windows, agents), generator)
     batch = _scaled(batch, _scales(windows, config, generator))
-    _, agents, steps = batch["history_valid"].shape
+    steps = batch["history_valid"].shape[2]
     lines = batch["centerlines_valid"].shape[1]
     first = torch.randint(0, steps - 1, (windows, 1, 1), generator=generator)
     late = chance(config.short_history, windows, 1, 1) & (torch.arange(steps) < first)
     drop = late | chance(config.missing_step, windows, agents, steps)
     hidden = chance(config.hidden_neighbour, windows, agents, 1)
+    hidden |= chance(config.alone, windows, 1, 1)
     hidden[:, 0] = False
     drop = drop | hidden
     drop[:, 0, -1] = False  # the target is seen now: that is what makes it a target
@@ -71,17 +85,27 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
     }
 
 
-def _parked(batch: Batch, parked: Tensor, standing: Tensor) -> Batch:
-    """The targets `parked` (B,), or all agents of the scenes `standing` (B,), have never moved.
+def _stood(batch: Batch, still: Tensor) -> Batch:
+    """The agents `still` (B, N) have never moved, and a target among them never will.
 
     Agents that are not seen now keep their past: where they are now is not known.
     """
     last = batch["history"][:, :, -1:]  # (B, N, 1, 2)
-    still = standing[:, None].repeat(1, last.shape[1])
-    still[:, 0] |= parked
     still = (still & batch["history_valid"][:, :, -1])[..., None, None]  # (B, N, 1, 1)
     future = torch.where(still[:, 0], last[:, 0], batch["future"])
     return batch | {"history": torch.where(still, last, batch["history"]), "future": future}
+
+
+def _ghosts(batch: Batch, ghost: Tensor, generator: torch.Generator) -> Batch:
+    """The neighbours `ghost` (B, N) move with the target, GHOST_M away or so."""
+    ghost[:, 0] = False
+    offset = GHOST_M * torch.randn((*ghost.shape, 1, 2), generator=generator)
+    copies = batch["history"][:, :1] + offset  # (B, N, T, 2)
+    chosen = ghost[..., None]  # (B, N, 1)
+    return batch | {
+        "history": torch.where(chosen[..., None], copies, batch["history"]),
+        "history_valid": torch.where(chosen, batch["history_valid"][:, :1], batch["history_valid"]),
+    }
 
 
 def _scales(windows: int, config: AugmentConfig, generator: torch.Generator) -> Tensor:

@@ -1,1 +1,2 @@
-BtrajectoriesJðó$ØÃÄXUCDpØÃŠeVC’»ØÃsWCßÙÃ}XC.RÙÃ¥YC„ÙÃ’ ZCâèÙÃB±[CJ4ÚÃ°Â\C¾ÚÃÛÔ]C?ËÚÃ»ç^CÍÛÃMû_CibÛÃ‹aC®ÛÃm$bCÉùÛÃë9cCŒEÜÃþOdCZ‘ÜÃ›feC2ÝÜÃ·}fC)ÝÃG•gCøtÝÃ=­hCäÀÝÃ‹ÅiCÔÞÃ!ÞjCÆXÞÃîökCº¤ÞÃßmC¯ðÞÃâ(nC¤<ßÃÞAoC›ˆßÃÀZpC”ÔßÃmsqC“ àÃÌ‹rC™làÃÂ£sC­¸àÃ2»tC
+BtrajectoriesJðf$ØÃ¾YUCêoØÃofVC×»ØÃNsWCôÙÃ®€XCTÙÃÅŽYC' ÙÃ¸ZCìÙÃœ­[C×7ÚÃt¾\CoƒÚÃ?Ð]CáÎÚÃñâ^C2ÛÃyö_CheÛÃÅ
+aCŒ°ÛÃÂbC¡ûÛÃ\5cC­FÜÃƒKdC±‘ÜÃ*beC­ÜÜÃDyfCŸ'ÝÃÌgCƒrÝÃ½¨hCV½ÝÃÁiCÞÃßÙjC¿RÞÃókCUÞÃ¾mCáçÞÃÜ&nCt2ßÃnAoC'}ßÃk\pC#ÈßÃÅwqC àÃ_“rCì_àÃ¯sCj­àÃ›ÊtC

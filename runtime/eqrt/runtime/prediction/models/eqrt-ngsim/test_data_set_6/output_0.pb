@@ -1,1 +1,3 @@
-BtrajectoriesJðBÙ×ÃâKTC$Ù×Ã“KTC(Ù×Ã•KTC?Ù×Ã¸KTC`Ù×ÃãKTC†Ù×ÃLTC³Ù×Ã1LTCéÙ×ÃcLTC/Ú×Ã±LTC‹Ú×Ã1MTCÛ×ÃùMTC¤Û×ÃOTCoÜ×Ã´PTCjÝ×ÃÇRTC™Þ×Ã_UTCþß×ÃXTC˜á×Ã"\TCdã×Ã@`TC]å×ÃÅdTC}ç×ÃiTCºé×Ã­nTC	ì×Ã×sTC`î×ÃýxTC±ð×Ãÿ}TCñò×ÃÄ‚TCõ×Ã7‡TC÷×ÃK‹TCÚø×ÃTCrú×Ãj’TCÖû×Ã¬•TC
+BtrajectoriesJð Ù×ÃÒLTC¯Ù×ÃÛLTCÁÙ×ÃäLTCÓÙ×ÃìLTCàÙ×ÃðLTCêÙ×ÃñLTCîÙ×ÃïLTCïÙ×ÃëLTCìÙ×ÃåLTCèÙ×ÃßLTCäÙ×ÃÙLTCàÙ×ÃÕLTCÞÙ×ÃÒLTCÞÙ×ÃÒLTCáÙ×ÃÔLTCæÙ×ÃÙLTCíÙ×ÃÞLTCôÙ×ÃåLTCüÙ×ÃëLTCÚ×ÃñLTCÚ×ÃõLTC
+Ú×ÃöLTC
+Ú×ÃöLTCÚ×ÃóLTCÚ×ÃñLTC	Ú×ÃñLTCÚ×ÃøLTC2Ú×ÃMTCkÚ×Ã3MTCÎÚ×ÃzMTC

@@ -1,0 +1,129 @@
+"""`eqrt` as a user runs it: in processes of its own, from an installation or this checkout."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Self
+
+import can
+
+from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.output.datagrams import decode_datagram
+from eqrt.runtime.output.forecasts import ForecastSet
+from source_tree import ROOT
+
+PATIENCE_S = 60.0  # for anything that a process should do at once
+EQRT = [sys.executable, "-m", "eqrt"]
+
+
+def environment(**more: str) -> dict[str, str]:
+    """Ours, and the car's sources on the path."""
+    return os.environ | {"PYTHONPATH": str(ROOT / "runtime")} | more
+
+
+def eqrt(*arguments: str, cwd: Path | None = None, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; `more` goes into its environment."""
+    return subprocess.run(
+        [*EQRT, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=cwd,
+        env=environment(**more),
+        timeout=PATIENCE_S,
+    )
+
+
+class Serving:
+    """`eqrt serve` in a process, from when it is ready; ended at the end of the `with` block."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._process = subprocess.Popen(
+            [*EQRT, "serve", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment(),
+        )
+        self.ready = ""
+        """The first line it printed."""
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def wait_until_ready(self) -> Self:
+        """Wait until it listens; it says so."""
+        assert self._process.stdout is not None
+        self.ready = self._process.stdout.readline()
+        assert self.ready.startswith("eqrt serve: "), self.end()
+        return self
+
+    def end(self, by: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
+        """Tell it to end: exit status, the rest of its output, its errors."""
+        self._process.send_signal(by)
+        stdout, stderr = self._process.communicate(timeout=PATIENCE_S)
+        return self._process.returncode, stdout, stderr
+
+    def __enter__(self) -> Self:
+        return self.wait_until_ready()
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.communicate()
+
+
+class Heard:
+    """What comes on a channel of the local bus and at a port, gathered while it comes."""
+
+    def __init__(self, channel: str, ids: Sequence[int] | None = None) -> None:
+        self.messages: list[can.Message] = []
+        self.forecasts: list[ForecastSet] = []
+        self._bus = open_bus(channel, LOCAL, receive_ids=ids)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        self.address = f"127.0.0.1:{self._socket.getsockname()[1]}"
+        self._ended = threading.Event()
+        self._threads = [threading.Thread(target=work) for work in (self._hear, self._receive)]
+
+    def _hear(self) -> None:
+        while not self._ended.is_set():
+            if (message := self._bus.recv(0.05)) is not None:
+                self.messages.append(message)
+
+    def _receive(self) -> None:
+        while not self._ended.is_set():
+            with contextlib.suppress(TimeoutError):
+                self.forecasts.append(decode_datagram(self._socket.recv(65_535)).forecasts)
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+        self._bus.shutdown()
+        self._socket.close()
+
+
+@contextlib.contextmanager
+def playing(log: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """`eqrt play` on the local bus, in a process."""
+    command = [*EQRT, "play", str(log), "--can-interface", LOCAL, *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment()) as process:
+        yield process
+        process.terminate()

@@ -1,0 +1,347 @@
+"""From messages to predictions: what is predicted when, in which mode; and nothing breaks it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from drives import DRIVES, TILE, Car, cycle, first_seconds, shipped_predictor, traffic
+from eqrt.core.contract import ModelContract
+from eqrt.core.frames import Pose2
+from eqrt.core.scene import Scene
+from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.predictor import Prediction
+from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.replay import replay
+from tiny_sensor import COUNTED, first, header, profile_of
+
+CARS = (
+    Car(object_id=3, x_m=20.0, y_m=0.0),
+    Car(object_id=7, x_m=5.0, y_m=3.5, speed_mps=12.0),
+    Car(object_id=9, x_m=60.0, y_m=-3.5, speed_mps=0.0),
+)
+POSE = Pose2(0.0, 0.0, 0.0)
+
+
+def pipeline_of(profile: str = "generic", *, tile: Path | None = None) -> Pipeline:
+    return Pipeline(load_profile(profile), shipped_predictor(), load_tile(tile) if tile else None)
+
+
+def feed(pipeline: Pipeline, messages: Iterable[can.Message]) -> list[ForecastSet]:
+    """As replay does, but nothing is closed at the end."""
+    made: list[ForecastSet] = []
+    for message in messages:
+        made += pipeline.poll(message.timestamp)
+        made += pipeline.feed(message, message.timestamp)
+    return made
+
+
+def poll(pipeline: Pipeline, start_s: float, end_s: float) -> list[ForecastSet]:
+    """Time passes without messages, as a service lets it: a hundredth at a time."""
+    times_s = np.arange(round(100 * start_s), round(100 * end_s)) / 100
+    return [made for now_s in times_s.tolist() for made in pipeline.poll(now_s)]
+
+
+def test_every_object_is_predicted_in_every_cycle() -> None:
+    """From where it was last measured, at its speed, under an id of our own that stays."""
+    forecasts = feed(pipeline_of(), traffic(CARS, 3.0, start_s=1000.0))
+    assert len(forecasts) == 31
+    for number, forecast in enumerate(forecasts):
+        assert forecast.cycle == number
+        assert forecast.timestamp_s == pytest.approx(1000.0 + number / 10, abs=1e-6)
+        np.testing.assert_array_equal(forecast.object_id, [3, 7, 9])
+        np.testing.assert_array_equal(forecast.track_id, forecasts[0].track_id)
+        np.testing.assert_allclose(forecast.anchor_s, forecast.timestamp_s)
+        x_m = [car.x_m + car.speed_mps * number / 10 for car in CARS]
+        np.testing.assert_allclose(forecast.position[:, 0], x_m, atol=0.005)
+    last = forecasts[-1]
+    np.testing.assert_allclose(last.velocity, [[10.0, 0.0], [12.0, 0.0], [0.0, 0.0]], atol=0.05)
+    contract = shipped_predictor().contract
+    assert last.trajectories.shape == (3, contract.num_modes, contract.horizon_steps, 2)
+    assert last.dt_s == contract.dt_s
+    assert last.model_id == shipped_predictor().model_id
+
+
+def test_predictions_go_on_from_the_measurement() -> None:
+    """One second ahead, a car that drives steadily is where it will be within two metres."""
+    last = feed(pipeline_of(), traffic(CARS, 3.0))[-1]
+    steps = round(1.0 / last.dt_s)
+    expected = last.position + np.array([[10.0, 0.0], [12.0, 0.0], [0.0, 0.0]])
+    assert np.linalg.norm(last.trajectories[:, 0, steps - 1] - expected, axis=-1).max() < 2.0
+
+
+def test_an_object_is_partial_until_its_history_is_full() -> None:
+    """The model reads two seconds; a car that comes later does not wait for the others."""
+    contract = shipped_predictor().contract
+    late = [*traffic(CARS[:1], 0.9)]
+    for step in range(10, 41):
+        late += cycle(CARS[:2], step / 10)
+    for step, forecast in enumerate(feed(pipeline_of(), late)):
+        for object_id, mode in zip(forecast.object_id, forecast.agent_mode, strict=True):
+            since = step if object_id == CARS[0].object_id else step - 10
+            assert mode == (Mode.RUN if since >= contract.history_steps - 1 else Mode.PARTIAL)
+
+
+def test_an_object_that_is_not_seen_keeps_its_anchor_and_then_goes() -> None:
+    """Predicted for 0.3 s from its last measurement, and its age says so."""
+    messages = [*traffic(CARS[:2], 2.0)]
+    for step in range(21, 27):
+        messages += cycle(CARS[:1], step / 10)
+    forecasts = feed(pipeline_of(), messages)[21:]
+    present = [CARS[1].object_id in forecast.object_id for forecast in forecasts]
+    assert present == [True, True, True, False, False, False]
+    for forecast in forecasts[:3]:
+        row = int(np.flatnonzero(forecast.object_id == CARS[1].object_id)[0])
+        assert forecast.anchor_s[row] == pytest.approx(2.0)
+        assert forecast.anchor_s[1 - row] == pytest.approx(forecast.timestamp_s)
+        assert forecast.age_s[row] == pytest.approx(forecast.made_s - 2.0)
+        np.testing.assert_allclose(forecast.position[row], [29.0, 3.5], atol=0.005)
+
+
+def test_cycles_that_come_too_close_share_a_prediction() -> None:
+    """A radar at 20 Hz is predicted ten times a second, and every cycle is tracked."""
+    pipeline = pipeline_of()
+    messages = [m for step in range(41) for m in cycle(CARS, step / 20)]
+    forecasts = feed(pipeline, messages)
+    assert len(forecasts) == 21
+    assert np.diff([forecast.timestamp_s for forecast in forecasts]) == pytest.approx(0.1)
+    assert pipeline.counters.skipped == 20
+    assert pipeline.tracks.counters.cycles == 41
+
+
+def test_a_second_sensor_that_measured_earlier_adds_no_prediction(tmp_path: Path) -> None:
+    """Its objects are in the next one."""
+    twin = COUNTED.replace('"tiny"', '"twin"', 1).replace(
+        "timeout_s", "latency_s = 0.03\ntimeout_s"
+    )
+    tables = twin[twin.index("[[sensor]]") :]
+    profile = profile_of(tmp_path, COUNTED + tables)
+    pipeline = Pipeline(profile, shipped_predictor())
+    made = []
+    for step in range(5):
+        for message in (header(1, step), first(20.0, 0.0, 5, counter=step)):
+            made += pipeline.feed(message, step / 10)
+        made += pipeline.poll(step / 10 + 0.06)
+    assert [round(forecast.timestamp_s, 3) for forecast in made] == [0.0, 0.1, 0.2, 0.3, 0.4]
+    assert [forecast.num_targets for forecast in made] == [1, 2, 2, 2, 2]
+
+
+def test_silence_is_said_after_three_periods_and_then_every_period() -> None:
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 1.0))
+    said = poll(pipeline, 1.0, 2.0)
+    assert {forecast.mode for forecast in said} == {Mode.SILENT}
+    np.testing.assert_allclose([f.made_s for f in said], np.arange(1.3, 2.0, 0.1), atol=0.011)
+    for forecast in said:
+        assert forecast.num_targets == 0
+        assert forecast.timestamp_s == pytest.approx(1.0, abs=1e-6)  # how old the input is
+
+
+def test_the_first_cycle_after_a_silence_is_predicted_again() -> None:
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 1.0))
+    poll(pipeline, 1.0, 5.0)
+    forecast = feed(pipeline, cycle(CARS, 5.0))[-1]
+    assert forecast.mode is Mode.NO_MAP
+    assert forecast.num_targets == 3
+
+
+def test_before_any_input_nothing_is_said() -> None:
+    assert poll(pipeline_of(), 0.0, 2.0) == []
+
+
+def test_an_hour_without_a_message_is_not_made_up_for() -> None:
+    """One word of silence when the log goes on, not one for every period that has passed."""
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 1.0))
+    said = poll(pipeline, 3600.0, 3600.5)
+    assert len(said) in (5, 6)
+    assert {forecast.mode for forecast in said} == {Mode.SILENT}
+
+
+def test_a_clock_that_was_set_back_starts_anew() -> None:
+    """Predictions come at once, and cycles that stay unfinished are closed again."""
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 2.0, start_s=5000.0))
+    forecasts = feed(pipeline, traffic(CARS, 2.0, start_s=100.0))
+    assert [f.timestamp_s for f in forecasts] == pytest.approx(np.arange(100.0, 102.05, 0.1))
+    assert {f.num_targets for f in forecasts} == {3}
+    unfinished = cycle(CARS, 2.1, start_s=100.0)[:-1]
+    assert feed(pipeline, unfinished) == []
+    (late,) = poll(pipeline, 102.1, 102.2)
+    assert late.timestamp_s == pytest.approx(102.1)
+
+
+def test_an_unfinished_cycle_is_predicted_when_its_time_is_over() -> None:
+    """Its first car came whole, of the second only the position."""
+    pipeline = pipeline_of()
+    assert feed(pipeline, cycle(CARS[:2], 0.0)[:-1]) == []
+    (forecast,) = poll(pipeline, 0.0, 0.1)
+    np.testing.assert_array_equal(forecast.object_id, [3, 7])
+
+
+def test_finishing_closes_what_is_open() -> None:
+    pipeline = pipeline_of()
+    feed(pipeline, cycle(CARS[:2], 0.0)[:-1])
+    (forecast,) = pipeline.finish(0.0)
+    assert forecast.num_targets == 2
+    assert pipeline.finish(0.0) == []
+
+
+def test_a_cycle_without_objects_says_that_there_are_none() -> None:
+    (forecast,) = feed(pipeline_of(), cycle([], 0.0))
+    assert (forecast.num_targets, forecast.mode) == (0, Mode.NO_MAP)
+
+
+def test_a_map_makes_full_service() -> None:
+    forecasts = feed(pipeline_of(tile=TILE), traffic(CARS, 0.5, pose=POSE))
+    assert {forecast.mode for forecast in forecasts} == {Mode.RUN}
+    assert {forecast.tile_id for forecast in forecasts} == {load_tile(TILE).info.tile_id}
+
+
+def test_without_a_pose_a_map_is_no_use() -> None:
+    """Objects are predicted all the same, without it."""
+    forecasts = feed(pipeline_of(tile=TILE), traffic(CARS, 0.5))
+    assert {forecast.mode for forecast in forecasts} == {Mode.NO_POSE}
+    without = feed(pipeline_of(), traffic(CARS, 0.5))
+    assert {forecast.mode for forecast in without} == {Mode.NO_MAP}
+    np.testing.assert_array_equal(forecasts[-1].trajectories, without[-1].trajectories)
+
+
+def test_without_ego_motion_nothing_is_predicted_unless_the_sensor_stands_still() -> None:
+    """The object list alone does not say how the car moves under it."""
+    alone = [m for m in traffic(CARS, 0.5) if m.arbitration_id != 0x5A0]
+    forecasts = feed(pipeline_of(), alone)
+    assert {(f.mode, f.num_targets) for f in forecasts} == {(Mode.NO_POSE, 0)}
+    profile = load_profile("generic")
+    standing = feed(Pipeline(profile, shipped_predictor(), stationary=True), alone)
+    assert {(f.mode, f.num_targets) for f in standing} == {(Mode.NO_MAP, 3)}
+
+
+def test_predictions_turn_and_move_with_the_map() -> None:
+    """Where the map has its origin is no matter to anybody: within a millimetre."""
+    here = feed(pipeline_of(), traffic(CARS, 2.0, pose=POSE))[-1]
+    elsewhere = Pose2(4000.0, -2500.0, 2.0)
+    there = feed(pipeline_of(), traffic(CARS, 2.0, pose=elsewhere))[-1]
+    np.testing.assert_allclose(elsewhere.apply(here.position), there.position, atol=1e-3)
+    np.testing.assert_allclose(elsewhere.apply(here.trajectories), there.trajectories, atol=1e-3)
+
+
+class Altered:
+    """The shipped model, something done to what it says."""
+
+    def __init__(self, rows: slice, value: float) -> None:
+        self.contract: ModelContract = shipped_predictor().contract
+        self.model_id = "altered"
+        self._rows, self._value = rows, value
+
+    def predict(self, scene: Scene) -> Prediction:
+        prediction = shipped_predictor().predict(scene)
+        trajectories = prediction.trajectories.copy()
+        trajectories[self._rows, :, 10:] = self._value
+        return replace(prediction, trajectories=trajectories)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
+def test_an_impossible_prediction_is_replaced_and_marked(value: float) -> None:
+    """For one car: the cycle goes on. For all of them: the cycle says so."""
+    profile = load_profile("generic")
+    for rows, mode in ((slice(1, 2), Mode.NO_MAP), (slice(None), Mode.FALLBACK)):
+        pipeline = Pipeline(profile, Altered(rows, value))  # type: ignore[arg-type]  # else the same
+        last = feed(pipeline, traffic(CARS, 2.0))[-1]
+        assert last.mode is mode
+        fell_back = last.agent_mode == Mode.FALLBACK
+        np.testing.assert_array_equal(np.flatnonzero(fell_back), np.arange(3)[rows])
+        assert pipeline.counters.fallbacks == 21 * fell_back.sum()
+        end = last.position + 3.0 * last.velocity
+        np.testing.assert_allclose(last.trajectories[1, 0, -1], end[1], atol=0.2)
+
+
+def test_a_prediction_that_took_longer_than_a_period_says_so() -> None:
+    """By a clock on which every look takes 40 ms."""
+    looks = itertools.count()
+    pipeline = Pipeline(
+        load_profile("generic"), shipped_predictor(), clock=lambda: 0.04 * next(looks)
+    )
+    (forecast,) = feed(pipeline, cycle(CARS, 0.0))
+    assert forecast.mode is Mode.LATE
+    assert forecast.compute_s > 0.1
+
+
+def test_a_messages_channel_decides_which_bus_it_is_of() -> None:
+    """The same messages on another bus of the car are nobody's."""
+    profile = load_profile("toyota-rav4")
+    lines = first_seconds(DRIVES["rav4"].log, 1.0).splitlines()
+    messages = [candump_message(line) for line in lines]
+    found = []
+    for channels in (DRIVES["rav4"].roles, {"radar": "can0", "car": "can1"}):
+        pipeline = Pipeline(profile, shipped_predictor(), channels=channels)
+        feed(pipeline, messages)
+        found.append(pipeline.decoder.counters.objects)
+    assert found[0] > 50
+    assert found[1] == 0
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_what_leaves_the_pipeline_is_always_sound(name: str) -> None:
+    """Ids are unique, numbers finite, probabilities sum to one, nothing is from the future."""
+    drive = DRIVES[name]
+    messages = [candump_message(line) for line in first_seconds(drive.log, 8.0).splitlines()]
+    pipeline = pipeline_of(drive.profile, tile=drive.tile)
+    targets = [assert_sound(forecast) for forecast in replay(pipeline, messages)]
+    assert sum(targets) == pipeline.counters.targets > 100
+
+
+@pytest.mark.parametrize("name", DRIVES)
+@pytest.mark.parametrize("seed", range(2))
+def test_no_message_breaks_the_pipeline(name: str, seed: int) -> None:
+    """Real ones between messages of the profile's ids with random bytes, lengths and kinds."""
+    drive, random = DRIVES[name], np.random.default_rng(seed)
+    ids = sorted(load_profile(drive.profile).arbitration_ids)
+    lines = first_seconds(drive.log, 3.0).splitlines()
+    pipeline = pipeline_of(drive.profile, tile=drive.tile)
+    fed = 0
+    for line in lines:
+        message = candump_message(line)
+        for noise in (random_message(ids, random) for _ in range(int(random.integers(0, 3)))):
+            for forecast in pipeline.feed(noise, message.timestamp):
+                assert_sound(forecast)
+            fed += 1
+            if fed > 3000:
+                return
+        for forecast in [*pipeline.poll(message.timestamp), *feed(pipeline, [message])]:
+            assert_sound(forecast)
+
+
+def random_message(ids: list[int], random: np.random.Generator) -> can.Message:
+    is_fd = bool(random.random() < 0.1)
+    return can.Message(
+        arbitration_id=int(random.choice(ids)),
+        is_extended_id=bool(random.random() < 0.1),
+        is_remote_frame=not is_fd and bool(random.random() < 0.1),
+        is_error_frame=not is_fd and bool(random.random() < 0.1),
+        is_fd=is_fd,
+        data=random.bytes(int(random.integers(0, 65 if is_fd else 9))),
+        check=False,
+    )
+
+
+def assert_sound(forecast: ForecastSet) -> int:
+    assert len(set(forecast.track_id.tolist())) == forecast.num_targets
+    for values in (forecast.position, forecast.velocity, forecast.trajectories):
+        assert np.isfinite(values).all()
+    assert (np.diff(forecast.probabilities, axis=1) <= 0.0).all()
+    np.testing.assert_allclose(forecast.probabilities.sum(axis=1), 1.0, atol=1e-3)
+    assert (forecast.age_s >= -1e-6).all()
+    reach_m = np.linalg.norm(forecast.trajectories - forecast.position[:, None, None], axis=-1)
+    assert reach_m.max(initial=0.0) < 90.0 * 3.1 + 2.0
+    return forecast.num_targets

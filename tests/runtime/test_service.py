@@ -1,0 +1,222 @@
+"""The service's clock, its loop on a real bus, and what it says every second."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import threading
+import time
+from collections.abc import Iterable
+
+import can
+import numpy as np
+import pytest
+
+from drives import DRIVES, first_seconds, shipped_predictor
+from eqrt.core.errors import BusError
+from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.play import OTHERS, Player
+from eqrt.runtime.serve import Merged
+from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Report, Service
+from forecast_sets import many, nobody, one_car
+
+CHANNELS = (f"service-{number}-{time.monotonic_ns()}" for number in itertools.count())
+WALL_S = 1.7e9  # any wall-clock time
+CYCLE_S = 0.073  # of the recorded radar
+
+
+# --- the clock
+
+
+def test_a_message_that_did_not_wait_arrived_now() -> None:
+    assert ArrivalClock().now_s(50.0, WALL_S, WALL_S) == 50.0
+
+
+def test_an_empty_queue_means_now() -> None:
+    clock = ArrivalClock()
+    assert [clock.now_s(t, None, WALL_S + t) for t in (50.0, 50.1)] == [50.0, 50.1]
+
+
+def test_a_message_that_waited_arrived_that_much_earlier() -> None:
+    """Ten messages, 0.1 s apart, are read at once a second after the first came."""
+    clock = ArrivalClock()
+    told = [clock.now_s(51.0, WALL_S + k / 10, WALL_S + 1.0) for k in range(10)]
+    np.testing.assert_allclose(told, 50.0 + np.arange(10) / 10, atol=1e-6)
+
+
+@pytest.mark.parametrize("set_by_s", [3600.0, -3600.0, 30.0, -5.0])
+def test_a_wall_clock_that_is_set_changes_nothing(set_by_s: float) -> None:
+    """Between two messages, and between a message's stamp and its being read."""
+    clock = ArrivalClock()
+    wall_s = WALL_S
+    told = [clock.now_s(50.0, wall_s, wall_s)]
+    told.append(clock.now_s(50.1, wall_s + 0.1, wall_s + 0.1 + set_by_s))
+    wall_s += set_by_s
+    told.append(clock.now_s(50.2, wall_s + 0.2, wall_s + 0.2))
+    np.testing.assert_allclose(told, [50.0, 50.1, 50.2], atol=1e-6)
+
+
+def test_a_wall_clock_set_forward_a_little_holds_the_time_for_that_one_message() -> None:
+    """It looks like a queue; the next message's stamp puts it right."""
+    clock = ArrivalClock()
+    clock.now_s(50.0, WALL_S, WALL_S)
+    assert clock.now_s(50.1, WALL_S + 0.1, WALL_S + 5.1) == 50.0
+    assert clock.now_s(50.2, WALL_S + 5.2, WALL_S + 5.2) == 50.2
+
+
+@pytest.mark.parametrize("stamp_s", [0.0, 1234.5, WALL_S - MAX_QUEUED_S - 1.0, WALL_S + 0.5])
+def test_a_stamp_of_another_clock_means_now(stamp_s: float) -> None:
+    """Some adapters count from when they were plugged in."""
+    assert ArrivalClock().now_s(50.0, stamp_s, WALL_S) == 50.0
+
+
+def test_the_time_told_never_goes_back() -> None:
+    """Whatever the stamps say."""
+    clock, random = ArrivalClock(), np.random.default_rng(0)
+    monotonic_s = 50.0 + np.cumsum(random.exponential(0.01, 3000))
+    stamps = [None if random.random() < 0.1 else WALL_S + random.normal(0, 5) for _ in monotonic_s]
+    told = [clock.now_s(m, s, WALL_S) for m, s in zip(monotonic_s.tolist(), stamps, strict=True)]
+    assert (np.diff(told) >= 0.0).all()
+    assert (np.array(told) <= monotonic_s).all()
+
+
+# --- the loop
+
+
+class Said:
+    """A publisher that keeps what it gets, and takes its time over one of the forecasts."""
+
+    def __init__(self, slow_at: int = -1, seconds: float = 0.0) -> None:
+        self.forecasts: list[ForecastSet] = []
+        self._slow_at, self._seconds = slow_at, seconds
+
+    def publish(self, forecast: ForecastSet) -> None:
+        if len(self.forecasts) == self._slow_at:
+            time.sleep(self._seconds)
+        self.forecasts.append(forecast)
+
+
+@pytest.fixture
+def radar() -> Pipeline:
+    return Pipeline(load_profile("ars408"), shipped_predictor(), clock=time.monotonic)
+
+
+def serve_recording(
+    pipeline: Pipeline, said: Said, *, seconds: float, then_s: float = 0.0
+) -> list[str]:
+    """The service on one end of the local bus, the recorded radar played on the other."""
+    channel = next(CHANNELS)
+    reports: list[str] = []
+    lines = first_seconds(DRIVES["ars408"].log, seconds).splitlines()
+    with open_bus(channel, LOCAL) as car, open_bus(channel, LOCAL) as service_bus:
+        service = Service(pipeline, service_bus, [said], reports.append)
+        played = threading.Event()
+
+        def play() -> None:
+            Player({OTHERS: car}).play(map(candump_message, lines), lambda: False)
+            time.sleep(then_s)
+            played.set()
+
+        player = threading.Thread(target=play)
+        player.start()
+        service.run(played.is_set)
+        player.join()
+    return reports
+
+
+def test_silence_is_said_when_the_radar_has_stopped_and_not_before(radar: Pipeline) -> None:
+    said = Said()
+    serve_recording(radar, said, seconds=1.5, then_s=0.6)
+    modes = [forecast.mode for forecast in said.forecasts[1:]]  # before the first, no speed came
+    first_silent = modes.index(Mode.SILENT)
+    assert first_silent >= 0.7 * 1.5 / CYCLE_S
+    assert set(modes[:first_silent]) == {Mode.NO_MAP}
+    assert set(modes[first_silent:]) == {Mode.SILENT}
+    quiet_s = said.forecasts[first_silent + 1].made_s - said.forecasts[first_silent].made_s
+    assert 0.3 <= quiet_s < 0.4
+
+
+def test_a_busy_service_does_not_take_a_full_queue_for_silence(radar: Pipeline) -> None:
+    """Held up for eight cycles, it predicts each of them afterwards, at its own time."""
+    said = Said(slow_at=5, seconds=8 * CYCLE_S)
+    serve_recording(radar, said, seconds=2.0, then_s=0.2)
+    assert {forecast.mode for forecast in said.forecasts[1:]} == {Mode.NO_MAP}
+    spacing_s = np.diff([forecast.timestamp_s for forecast in said.forecasts])
+    assert (spacing_s < 0.2).all()
+    assert len(said.forecasts) >= 0.7 * 2.0 / CYCLE_S
+
+
+def test_every_second_there_is_a_line(radar: Pipeline) -> None:
+    reports = serve_recording(radar, Said(), seconds=2.5)
+    assert len(reports) == 2
+    for line in reports:
+        assert re.fullmatch(
+            r"NO_MAP     [12] objects +\d+\.\d predictions/s  latency +\d+\.\d ms "
+            r"\(worst +\d+\.\d\) +\d+ messages/s",
+            line,
+        )
+
+
+def test_a_bus_that_goes_away_ends_the_service_with_an_explanation(radar: Pipeline) -> None:
+    bus = open_bus(next(CHANNELS), LOCAL)
+    bus.shutdown()
+    with pytest.raises(BusError, match=r"can no longer be read .*start again"):
+        Service(radar, bus, [], print).run(lambda: False)
+
+
+# --- several buses as one
+
+
+def test_messages_of_several_buses_come_with_the_names_of_their_channels() -> None:
+    names = [next(CHANNELS), next(CHANNELS)]
+    buses = {name: open_bus(name, "virtual") for name in names}
+    senders = {name: open_bus(name, "virtual") for name in names}
+    with Merged(buses) as merged:
+        for number, name in enumerate(names * 2):
+            senders[name].send(can.Message(arbitration_id=number))
+        heard = [merged.recv(5.0) for _ in range(4)]
+        assert merged.recv(0.01) is None
+    found = {(m.arbitration_id, m.channel) for m in heard if m is not None}
+    assert found == {(0, names[0]), (1, names[1]), (2, names[0]), (3, names[1])}
+    close([*buses.values(), *senders.values()])
+
+
+def test_a_bus_that_fails_is_not_taken_for_a_silent_one(radar: Pipeline) -> None:
+    """python-can reads it in a thread, whose error must not be lost."""
+    names = [next(CHANNELS), next(CHANNELS)]
+    buses = {name: open_bus(name, LOCAL) for name in names}
+    with Merged(buses) as merged:
+        buses[names[1]].shutdown()
+        with pytest.raises(BusError, match="can no longer be read"):
+            Service(radar, merged, [], print).run(lambda: False)
+    close(buses.values())
+
+
+def close(buses: Iterable[can.BusABC]) -> None:
+    for bus in buses:
+        bus.shutdown()
+
+
+# --- what is said
+
+
+def test_the_report_of_a_second_is_one_line() -> None:
+    report = Report(messages=900, latencies_s=[0.010, 0.012, 0.030], newest=many(32))
+    assert report.line(1.0) == (
+        "RUN       32 objects   3.0 predictions/s  latency  12.0 ms (worst  30.0)    900 messages/s"
+    )
+    assert "  1.5 predictions/s" in report.line(2.0)
+    assert "    450 messages/s" in report.line(2.0)
+
+
+def test_the_report_says_what_is_missing() -> None:
+    assert Report(messages=120).line(1.0) == "no object cycle (120 messages/s)"
+    assert Report().line(1.0) == "no object cycle (0 messages/s)"
+    silent = Report(newest=nobody()).line(1.0)
+    assert silent.startswith("SILENT     0 objects   0.0 predictions/s")
+    assert "latency" not in silent
+    assert Report(newest=one_car()).line(1.0).startswith("NO_MAP     1 objects")
