@@ -44,7 +44,13 @@ CONFIG = ModelConfig(
     pointers=2,
     dropout=0.1,
 )
-CARD = Card(name="test", data="made up", license="Apache-2.0", metrics={"ade_3s": 1.0})
+CARD = Card(
+    name="test",
+    data="made up",
+    license="Apache-2.0",
+    metrics={"ade_3s": 1.0},
+    baseline={"ade_3s": 2.0},
+)
 
 
 @pytest.fixture(scope="module")

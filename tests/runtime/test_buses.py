@@ -82,6 +82,21 @@ def test_who_sends_does_not_hear_it(pair: tuple[can.BusABC, can.BusABC]) -> None
     assert second.recv(5.0) is not None
 
 
+@LINUX
+def test_a_message_is_stamped_when_it_comes_not_when_it_is_read(
+    pair: tuple[can.BusABC, can.BusABC],
+) -> None:
+    """As a CAN driver does it, so that a busy reader knows how long it waited."""
+    first, second = pair
+    before_s = time.time()
+    first.send(MESSAGES[0])
+    after_s = time.time()
+    time.sleep(0.05)
+    received = second.recv(5.0)
+    assert received is not None
+    assert before_s - 0.001 <= received.timestamp <= after_s + 0.001
+
+
 def test_channels_of_the_local_bus_are_apart(pair: tuple[can.BusABC, can.BusABC]) -> None:
     first, _ = pair
     with open_bus(next(CHANNELS), LOCAL) as other:

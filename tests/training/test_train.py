@@ -63,6 +63,7 @@ def test_the_command_writes_a_checkpoint_that_says_where_it_comes_from(
     model, card = load_checkpoint(out / "model.safetensors")
     assert model.config == CONFIG.model
     assert card.license == "CC-BY-SA-4.0"
+    assert card.metrics.keys() == card.baseline.keys()
     assert card.metrics["fde_3s"] > 0.0
     (line,) = (out / "metrics.jsonl").read_text().splitlines()
     assert json.loads(line)["step"] == 2

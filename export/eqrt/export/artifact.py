@@ -101,16 +101,19 @@ def _write_checksums(folder: Path) -> None:
 
 
 def _model_card(contract: ModelContract, card: Card) -> str:
-    rows = "".join(f"| {name} | {value:.3f} m |\n" for name, value in card.metrics.items())
+    rows = "".join(
+        f"| {name.replace('_', ' ').upper()} | {value:.3f} m | {card.baseline[name]:.3f} m |\n"
+        for name, value in card.metrics.items()
+    )
     tensors = "".join(
-        f"| `{name}` | {kind} | {list(shape)} |\n"
+        f"| `{name}` | {kind} | ({', '.join(map(str, shape))}) |\n"
         for name, (kind, shape) in (contract.inputs | contract.outputs).items()
     )
+    modes = f"{contract.num_modes} trajectories" if contract.num_modes > 1 else "one trajectory"
     return f"""# {contract.name} {contract.version}
 
 Predicts where traffic goes: for each target, its history and its neighbours' and the lane
-centerlines around it become {contract.num_modes} trajectory(ies) of \
-{contract.horizon_steps * contract.dt_s:g} s.
+centerlines around it become {modes} of {contract.horizon_steps * contract.dt_s:g} s.
 
 | | |
 | --- | --- |
@@ -121,8 +124,8 @@ centerlines around it become {contract.num_modes} trajectory(ies) of \
 
 Errors of the most probable trajectory on held-out recordings:
 
-| metric | value |
-| --- | --- |
+| metric | this model | constant velocity |
+| --- | --- | --- |
 {rows}
 | tensor | type | shape |
 | --- | --- | --- |

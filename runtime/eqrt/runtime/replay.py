@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     channels = parse_channels(args.can, profile.roles)
     pipeline = load_pipeline(args, profile, channels or None, clock=None)
     started_s = time.perf_counter()
-    with _output(args.out) as out:
+    with output(args.out) as out:
         for forecast in replay(pipeline, log):
             out.write(json_lines(forecast))
     seconds = time.perf_counter() - started_s
@@ -84,7 +84,7 @@ def replay(pipeline: Pipeline, messages: Iterable[can.Message]) -> Iterator[Fore
 
 
 @contextlib.contextmanager
-def _output(name: str) -> Iterator[BinaryIO]:
+def output(name: str) -> Iterator[BinaryIO]:
     """Standard output, or a file that appears when it is whole."""
     if name == "-":
         yield sys.stdout.buffer

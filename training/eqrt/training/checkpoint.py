@@ -28,6 +28,8 @@ class Card:
     """Licence of the weights (an SPDX expression)."""
     metrics: dict[str, float]
     """Measured on the held-out data, metres."""
+    baseline: dict[str, float]
+    """Of constant velocity on the same data."""
 
 
 def save_checkpoint(path: Path, model: EquivariantPredictor, card: Card) -> None:

@@ -118,6 +118,11 @@ class Pairs:
     valid: Tensor
     """(B, N, N, 1) 1.0 where agent j exists and is not i."""
 
+    def of(self, receivers: int) -> Pairs:
+        """The pairs in which i is one of the first `receivers` agents."""
+        own = slice(receivers)
+        return Pairs(self.weights[:, own], self.relations[:, own], self.valid[:, own])
+
 
 class FeatureLearning(nn.Module):
     """One feature-learning layer: geometric, then pattern features (EqMotion, section 4.3).
@@ -141,24 +146,34 @@ class FeatureLearning(nn.Module):
         self.dropout = nn.Dropout(dropout)
         self.norm = nn.LayerNorm(width)
 
-    def forward(self, geometric: Tensor, pattern: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
-        """Geometric (B, N, 2, C) and pattern (B, N, D) -> the same two, further on."""
-        weights, pair_valid = pairs.weights, pairs.valid
-        offset = geometric.unsqueeze(1) - geometric.unsqueeze(2)  # (B, N, N, 2, C) from i to j
-        distance = torch.cat([length(offset), pairs.relations], -1)
-        message = self._messages(distance, pattern, weights) * pair_valid  # (B, N, N, D)
-        count = pair_valid.sum(2).clamp(min=1.0)  # (B, N, 1)
-        pull = (self.pull(message) * pair_valid).unsqueeze(-2)  # (B, N, N, 1, C) does not turn
-        aggregated = (pull * offset).sum(2) / count.unsqueeze(-2)  # (B, N, 2, C)
-        scale = 1.0 + self.inner(pattern).unsqueeze(-2)  # (B, N, 1, C)
-        geometric = geometric + self.step * self.nonlinearity(scale * geometric + aggregated)
-        seen = self.update(self._invariants(geometric, pattern, message.sum(2) / count))
-        return geometric, self.norm(pattern + self.dropout(seen))
+    def forward(
+        self, geometric: Tensor, pattern: Tensor, pairs: Pairs, receivers: int
+    ) -> tuple[Tensor, Tensor]:
+        """Geometric (B, N, 2, C) and pattern (B, N, D) -> the same two, further on.
 
-    def _messages(self, distance: Tensor, pattern: Tensor, weights: Tensor) -> Tensor:
-        """Messages (B, N, N, D) from agent j to i, the categories already mixed."""
-        pair = self.receiver(pattern).unsqueeze(2) + self.sender(pattern).unsqueeze(1)
-        stacked = nn.functional.silu(pair + self.distance(distance))  # (B, N, N, R * D)
+        Only the first `receivers` agents are returned, (B, receivers, ...): after the last layer
+        nobody asks for the neighbours.
+        """
+        own, own_pattern = geometric[:, :receivers], pattern[:, :receivers]
+        pairs = pairs.of(receivers)
+        offset = geometric.unsqueeze(1) - own.unsqueeze(2)  # (B, R, N, 2, C) from i to j
+        distance = torch.cat([length(offset), pairs.relations], -1)
+        message = self._messages(distance, own_pattern, pattern, pairs.weights)
+        message = message * pairs.valid  # (B, R, N, D)
+        count = pairs.valid.sum(2).clamp(min=1.0)  # (B, R, 1)
+        pull = (self.pull(message) * pairs.valid).unsqueeze(-2)  # (B, R, N, 1, C) does not turn
+        aggregated = (pull * offset).sum(2) / count.unsqueeze(-2)  # (B, R, 2, C)
+        scale = 1.0 + self.inner(own_pattern).unsqueeze(-2)  # (B, R, 1, C)
+        own = own + self.step * self.nonlinearity(scale * own + aggregated)
+        seen = self.update(self._invariants(own, own_pattern, message.sum(2) / count))
+        return own, self.norm(own_pattern + self.dropout(seen))
+
+    def _messages(
+        self, distance: Tensor, own_pattern: Tensor, pattern: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Messages (B, R, N, D) from agent j to i, the categories already mixed."""
+        pair = self.receiver(own_pattern).unsqueeze(2) + self.sender(pattern).unsqueeze(1)
+        stacked = nn.functional.silu(pair + self.distance(distance))  # (B, R, N, categories * D)
         by_category = stacked.view(*stacked.shape[:-1], self.categories, -1)
         mixed: Tensor = (by_category * weights.unsqueeze(-1)).sum(-2)
         return mixed

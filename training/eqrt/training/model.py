@@ -60,8 +60,10 @@ class EquivariantPredictor(nn.Module):
         relation = relations((last - last[:, :1]) / UNIT_M, motion.velocity[..., COURSE])
         weights = self.interaction(torch.cat([length(offset), relation], -1), pattern)
         pairs = Pairs(weights, relation, pair_valid)
-        for layer in self.layers:
-            geometric, pattern = layer(geometric, pattern, pairs)
+        last_layer = len(self.layers) - 1
+        for index, layer in enumerate(self.layers):
+            receivers = 1 if index == last_layer else exists.shape[1]
+            geometric, pattern = layer(geometric, pattern, pairs, receivers)
 
         trajectories, probabilities = self.decoder(
             geometric[:, 0], pattern[:, 0], motion.velocity[:, 0], motion.deviation

@@ -90,8 +90,13 @@ def run(args: argparse.Namespace) -> int:
     model = train(config, training, held_out, steps, args.out)
     metrics = evaluate(model, held_out)
     print(f"held out            {_row(metrics)}")
-    credits_, license_ = config.data.credits, config.data.license
-    card = Card(name=config.name, data=credits_, license=license_, metrics=metrics)
+    card = Card(
+        name=config.name,
+        data=config.data.credits,
+        license=config.data.license,
+        metrics=metrics,
+        baseline=course,
+    )
     save_checkpoint(args.out / "model.safetensors", model, card)
     print(f"checkpoint          {args.out / 'model.safetensors'}")
     return 0

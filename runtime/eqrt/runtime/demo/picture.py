@@ -44,6 +44,8 @@ class Moment:
 def render(moment: Moment) -> str:
     """The SVG text. Raises ValueError if there is nothing to draw."""
     shown = [*moment.agents, *(line for lines in moment.lines.values() for line in lines)]
+    if not shown:
+        raise ValueError("nothing to draw: no agent and no line")
     view = _View.around(shown if moment.ego is None else [*shown, moment.ego])
     body = [_lane(view, lane) for lane in moment.lanes]
     for name, (color, width, dash, _) in _STYLES.items():

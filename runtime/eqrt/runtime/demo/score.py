@@ -22,6 +22,7 @@ VELOCITY_S = 0.5
 MAX_GAP_S = 0.3
 """The truth is interpolated between measurements at most this far apart."""
 _FORGET_S = 8.0
+_SAME_TIME_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +118,12 @@ class _Places:
     def at(self, times_s: Float64) -> Float64 | None:
         """Positions (n, 2) at `times_s` (n,); None if one of them is not between measurements."""
         known = np.array(self._times_s)
-        after = np.searchsorted(known, times_s - 1e-6)
-        if after[-1] == len(known) or (after[0] == 0 and times_s[0] < known[0] - 1e-6):
+        after = np.searchsorted(known, times_s - _SAME_TIME_S)
+        if after[-1] == len(known) or times_s[0] < known[0] - _SAME_TIME_S:
             return None
         before = np.maximum(after - 1, 0)
-        hit = np.abs(known[after] - times_s) <= 1e-6
-        if (~hit & (known[after] - known[before] > MAX_GAP_S)).any():
+        hit = np.abs(known[after] - times_s) <= _SAME_TIME_S
+        if (~hit & (known[after] - known[before] > MAX_GAP_S + _SAME_TIME_S)).any():
             return None
         positions = np.array(self._positions)
         return np.stack([np.interp(times_s, known, positions[:, i]) for i in (0, 1)], axis=-1)

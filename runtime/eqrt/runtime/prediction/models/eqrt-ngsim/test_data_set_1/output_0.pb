@@ -1,2 +1,1 @@
-BtrajectoriesJðf$ØÃ¾YUCêoØÃofVC×»ØÃNsWCôÙÃ®€XCTÙÃÅŽYC' ÙÃ¸ZCìÙÃœ­[C×7ÚÃt¾\CoƒÚÃ?Ð]CáÎÚÃñâ^C2ÛÃyö_CheÛÃÅ
-aCŒ°ÛÃÂbC¡ûÛÃ\5cC­FÜÃƒKdC±‘ÜÃ*beC­ÜÜÃDyfCŸ'ÝÃÌgCƒrÝÃ½¨hCV½ÝÃÁiCÞÃßÙjC¿RÞÃókCUÞÃ¾mCáçÞÃÜ&nCt2ßÃnAoC'}ßÃk\pC#ÈßÃÅwqC àÃ_“rCì_àÃ¯sCj­àÃ›ÊtC
+BtrajectoriesJðe$ØÃ“ZUCÖoØÃ=hVC®»ØÃ0vWC¼ÙÃ´„XCÞSÙÃü“YCþŸÙÃ)¤ZCìÙÃLµ[C8ÚÃhÇ\CÞƒÚÃ|Ú]C ÏÚÃ{î^CMÛÃX`CéfÛÃaCy²ÛÃh/bCþÛÃyFcC†IÜÃ'^dC•ÜÃfveC‰àÜÃ-fC,ÝÃx¨gC‚wÝÃBÂhCøÂÝÃŽÜiCgÞÃ[÷jCÐYÞÃ­lC6¥ÞÃ….mC ðÞÃâJnC<ßÃ¾goC»‡ßÃ…pC ÓßÃ¶¢qCôàÃšÀrCðlàÃ…ÞsCÝºàÃ/ütC

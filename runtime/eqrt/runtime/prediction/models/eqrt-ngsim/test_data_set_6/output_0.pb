@@ -1,3 +1,1 @@
-BtrajectoriesJП═ывцрLTC╞ывцшLTCаывцДLTCсывцЛLTCЮывцПLTCЙывцЯLTCНывцОLTCОывцКLTCЛывцЕLTCХывцъLTCДывцыLTCЮывцуLTCчывцрLTCчывцрLTCАывцтLTCФывцыLTCМывцчLTCТывцЕLTCЭывцКLTCзвцЯLTCзвцУLTC
-звцЖLTC
-звцЖLTCзвцСLTCзвцЯLTC	звцЯLTCзвцЬLTC2звцMTCkзвц3MTCнзвцzMTC
+BtrajectoriesJП▓ывцжLTCuывцоLTCPывцюLTC,ывц╞LTCывц═LTCВьвц∙LTCКьвц░LTCХьвц░LTCМьвц√LTCВьвц÷LTCывц╙LTCывц╥LTCывцбLTC&ывцлLTC)ывцрLTC&ывцтLTCывцрLTCывцлLTCШьвцаLTCДьвц╡LTCкьвц║LTC╡ьвц█LTC ьвцwLTC└ьвц`LTCpьвцGLTC\ьвц+LTCEьвцLTC$ьвцБKTCЯввц╜KTC═ввцcKTC

@@ -1,0 +1,201 @@
+"""`eqrt replay`: the service on a log, the same bytes every time, and a file only when whole."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drives import DRIVES, Car, first_seconds, shipped_predictor, traffic
+from eqrt.cli import main
+from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.json_lines import json_lines
+from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.replay import output, replay
+from processes import EQRT, environment, eqrt
+from source_tree import ROOT
+
+NGSIM = DRIVES["ngsim"]
+KEYS = {  # of docs/output.md
+    "cycle": int,
+    "time_s": float,
+    "cycle_mode": str,
+    "model_id": str,
+    "tile_id": str,
+    "track_id": int,
+    "object_id": int,
+    "mode": str,
+    "anchor_s": float,
+    "age_s": float,
+    "dt_s": float,
+    "position": list,
+    "velocity": list,
+    "probabilities": list,
+    "trajectories": list,
+}
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Four seconds of NGSIM."""
+    path = tmp_path / "drive.log"
+    path.write_text(first_seconds(NGSIM.log, 4.0))
+    return path
+
+
+def run(log: Path, out: Path | str, *options: str) -> int:
+    return main(["replay", str(log), *(options or NGSIM.options), "--out", str(out)])
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_the_same_log_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
+    """In another process, with another order of hashes, and from the packed log."""
+    packed = tmp_path / "packed.log.gz"
+    packed.write_bytes(gzip.compress(log.read_bytes()))
+    for source, seed in ((log, "0"), (packed, "1")):
+        out = tmp_path / f"{seed}.jsonl"
+        done = eqrt("replay", str(source), *NGSIM.options, "--out", str(out), PYTHONHASHSEED=seed)
+        assert (done.returncode, done.stdout) == (0, "")
+    assert (tmp_path / "0.jsonl").read_bytes() == (tmp_path / "1.jsonl").read_bytes()
+
+
+def test_a_line_has_the_documented_keys_and_only_those(log: Path, tmp_path: Path) -> None:
+    assert run(log, tmp_path / "out.jsonl") == 0
+    contract, lines = shipped_predictor().contract, lines_of(tmp_path / "out.jsonl")
+    documented = (ROOT / "docs/output.md").read_text().partition("## JSON lines")[2]
+    assert len(lines) > 500
+    for line in lines:
+        assert list(line) == list(KEYS)
+        for key, kind in KEYS.items():
+            assert isinstance(line[key], kind), key
+        shape = (contract.num_modes, contract.horizon_steps, 2)
+        assert np.shape(line["trajectories"]) == shape
+        assert np.shape(line["probabilities"]) == shape[:1]
+        assert Mode[line["mode"]] in (Mode.RUN, Mode.PARTIAL, Mode.FALLBACK)
+        assert Mode[line["cycle_mode"]] is Mode.RUN
+    assert all(f"`{key}`" in documented for key in KEYS)
+
+
+def test_lines_are_those_of_a_pipeline_fed_by_hand(log: Path, tmp_path: Path) -> None:
+    assert run(log, tmp_path / "out.jsonl") == 0
+    assert NGSIM.tile is not None
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(NGSIM.tile))
+    by_hand: list[ForecastSet] = []
+    for line in log.read_text().splitlines():
+        message = candump_message(line)
+        by_hand += pipeline.poll(message.timestamp)
+        by_hand += pipeline.feed(message, message.timestamp)
+    by_hand += pipeline.finish(message.timestamp)
+    assert b"".join(map(json_lines, by_hand)) == (tmp_path / "out.jsonl").read_bytes()
+
+
+def test_the_last_cycle_counts_although_the_log_ends_in_it() -> None:
+    """Its rest was never recorded."""
+    cars = [Car(object_id=1, x_m=20.0, y_m=0.0), Car(object_id=2, x_m=30.0, y_m=3.0)]
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor())
+    last = list(replay(pipeline, list(traffic(cars, 0.3))[:-1]))[-1]
+    assert last.timestamp_s == pytest.approx(0.3)
+    assert last.num_targets == 2
+
+
+def test_a_replay_ends_with_a_line_about_it(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(log, tmp_path / "out.jsonl") == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"eqrt replay: {len(log.read_text().splitlines())} messages, 40 cycles, ")
+    assert f", {len(lines_of(tmp_path / 'out.jsonl'))} predictions in " in err
+    assert err.count("\n") == 1
+
+
+def test_a_log_that_ends_in_a_line_is_read_up_to_there_and_reported(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = log.read_text()
+    log.write_text(whole[: whole.index("\n", len(whole) // 2) + 20])
+    assert run(log, tmp_path / "out.jsonl") == 0
+    remark, _ = capsys.readouterr().err.splitlines()
+    assert remark.startswith(f"eqrt: {log}: ends in the middle of line ")
+    assert len(lines_of(tmp_path / "out.jsonl")) > 100
+
+
+def test_standard_output_gets_the_lines_and_nothing_else(log: Path, tmp_path: Path) -> None:
+    done = eqrt("replay", str(log), *NGSIM.options, "--out", "-")
+    assert run(log, tmp_path / "out.jsonl") == 0
+    assert done.stdout.encode() == (tmp_path / "out.jsonl").read_bytes()
+    assert done.stderr.startswith("eqrt replay: ")
+
+
+def test_a_reader_that_has_seen_enough_ends_the_replay_quietly(log: Path) -> None:
+    """As `head` does."""
+    command = [*EQRT, "replay", str(log), *NGSIM.options, "--out", "-"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert json.loads(process.stdout.readline())
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+
+
+def test_a_replay_that_fails_leaves_what_was_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The output appears when it is whole, in one step."""
+    out, empty = tmp_path / "out.jsonl", tmp_path / "empty.log"
+    out.write_text("yesterday's\n")
+    empty.write_text("no message here\n")
+    assert run(empty, out) == 1
+    assert "there is no CAN message in it" in capsys.readouterr().err
+    assert out.read_text() == "yesterday's\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.log", "out.jsonl"]
+
+
+def test_while_a_replay_writes_its_output_is_not_there(tmp_path: Path) -> None:
+    out = tmp_path / "out.jsonl"
+    with output(str(out)) as stream:
+        stream.write(b"half\n")
+        assert not out.exists()
+    assert out.read_bytes() == b"half\n"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no devices in the file system")
+def test_a_device_is_written_and_stays_a_device(log: Path) -> None:
+    assert run(log, "/dev/null") == 0
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize(
+    ("options", "objects"),
+    [
+        (["--can", "radar=can1", "--can", "car=can0"], True),
+        (["--can", "radar=can0", "--can", "car=can1"], False),
+        (["--can", "can1"], True),
+        (["--can", "can0"], False),
+    ],
+)
+def test_only_the_named_channels_of_a_log_are_read(
+    options: list[str], objects: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The RAV4's radar is on can1, its wheels are on can0."""
+    log = tmp_path / "drive.log"
+    log.write_text(first_seconds(DRIVES["rav4"].log, 1.0))
+    assert run(log, tmp_path / "out.jsonl", *DRIVES["rav4"].options, *options) == 0
+    found = int(capsys.readouterr().err.split(" cycles, ")[1].split()[0])
+    assert (found > 0) == objects
