@@ -9,7 +9,7 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint bench clean
+.PHONY: help demo test test-runtime lint bench figures clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -31,6 +31,9 @@ lint: $(VENV)/.installed ## check format, style, types, and who imports whom
 
 bench: $(VENV)/.installed ## measure against the budgets; wants a quiet machine
 	$(VENV)/bin/python -m pytest --benchmark-enable --benchmark-only tests/bench
+
+figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, measured; wants it quiet
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/figures.py
 
 clean: ## remove the environments and everything else that was made here
 	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis

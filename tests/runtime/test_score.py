@@ -12,9 +12,10 @@ from eqrt.core.frames import Pose2
 from eqrt.runtime.demo.score import MAX_GAP_S, Scoreboard, Scored
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 
-DT_S, STEPS = 0.1, 30
-AHEAD_S = DT_S * np.arange(1, STEPS + 1)
 Float64 = NDArray[np.float64]
+
+DT_S, STEPS = 0.1, 30
+AHEAD_S: Float64 = DT_S * np.arange(1, STEPS + 1, dtype=np.float64)
 Course = Callable[[float], tuple[float, float]]
 """Time -> place."""
 

@@ -99,7 +99,7 @@ def output(name: str) -> Iterator[BinaryIO]:
             os.replace(written, path)
     except OSError as error:
         raise UsageError(
-            f"cannot write {path} ({error.strerror}); give --out a file in a folder that exists"
+            f"cannot write {path} ({error.strerror}); give --out a file that can be written"
         ) from error
     finally:
         if not in_place:

@@ -95,6 +95,8 @@ def _options(interface: str, fd: bool | None) -> dict[str, Any]:
 def _explanation(channel: str, interface: str, error: Exception) -> str:
     if interface not in interface_names():
         return f"there is no CAN interface {interface!r}; known are {', '.join(interface_names())}"
+    if interface == LOCAL:
+        return f"cannot open CAN channel {channel!r} through {LOCAL}: {error}"
     reason = " ".join(f"{error}".split()) or type(error).__name__
     if isinstance(error.__cause__, OSError):
         reason += f": {error.__cause__.strerror}"

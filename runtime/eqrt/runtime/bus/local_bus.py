@@ -10,6 +10,7 @@ route, sends into the local network, and brings a further package.)
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import socket
 import struct
@@ -53,9 +54,10 @@ class LocalBus(can.BusABC):
             self._join()
         except OSError as error:
             self.shutdown()
-            raise can.CanInitializationError(
-                f"no loopback network ({error.strerror}); switch it on with: ip link set lo up"
-            ) from error
+            problem = f"no loopback network ({error.strerror}); switch it on: ip link set lo up"
+            if error.errno == errno.EADDRINUSE:
+                problem = f"another program keeps UDP port {PORT} for itself; end it"
+            raise can.CanInitializationError(problem) from error
 
     def _join(self) -> None:
         loopback = socket.inet_aton(_LOOPBACK)

@@ -94,6 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play, predict, score and draw each part."""
+    if args.seconds is not None and not args.seconds > 0.0:
+        raise UsageError(f"--seconds is {args.seconds}; give a number above 0, 10 shows something")
     _make_folder(args.out)
     parts = [part for part in PARTS if args.part in (None, part.name)]
     for index, part in enumerate(parts):

@@ -1,1 +1,1 @@
-BtrajectoriesJП▓ывцжLTCuывцоLTCPывцюLTC,ывц╞LTCывц═LTCВьвц∙LTCКьвц░LTCХьвц░LTCМьвц√LTCВьвц÷LTCывц╙LTCывц╥LTCывцбLTC&ывцлLTC)ывцрLTC&ывцтLTCывцрLTCывцлLTCШьвцаLTCДьвц╡LTCкьвц║LTC╡ьвц█LTC ьвцwLTC└ьвц`LTCpьвцGLTC\ьвц+LTCEьвцLTC$ьвцБKTCЯввц╜KTC═ввцcKTC
+BtrajectoriesJП²ывцлLTC·ывцъLTC·ывцЗLTC⌡ывцMTC≤ывц/MTC⌠ывц@MTC▐ывцIMTC┼ывцLMTC├ывцJMTC└ывцCMTC┐ывц<MTC└ывц4MTC┤ывц/MTC▄ывц-MTC▓ывц/MTC ывц4MTCёывц=MTC╜ывцHMTC╥ывцTMTCбывцaMTCлывцmMTCвывцwMTCАывц┌MTCНывц▌MTCЩывц╒MTCзвццMTC+звцЩMTCQзвц^NTC├звцЗNTCпзвцЙOTC

@@ -1,0 +1,77 @@
+"""`eqrt demo` as its user sees it: started anywhere, it plays, predicts, scores and draws."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from eqrt.cli import main
+from eqrt.runtime.demo.command import PARTS
+from processes import eqrt
+
+LINE = re.compile(r"  +\d+ s  (RUN|LATE) +\d+ objects +\d+\.\d ms")
+TABLE = re.compile(r"  (eqrt|constant velocity) +" + r" +".join([r"\d+\.\d\d"] * 6))
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
+    """Six seconds of the first part, from an empty directory."""
+    folder = tmp_path_factory.mktemp("empty")
+    done = eqrt("demo", "--part", "ngsim", "--seconds", "6", "--out", "pictures", cwd=folder)
+    return done, folder
+
+
+def test_the_demo_shows_predictions_against_what_happened(
+    demo: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    """A line a second, from the fourth or fifth on with errors; then the figures in a table."""
+    done, _ = demo
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    seconds = [line for line in lines if LINE.match(line)]
+    assert len(seconds) >= 4
+    assert re.search(r"ADE 3 s +\d+\.\d\d m \(constant velocity +\d+\.\d\d\)", seconds[-1])
+    first, second = [match for line in lines if (match := TABLE.fullmatch(line))]
+    assert (first[1], second[1]) == ("eqrt", "constant velocity")
+    scored = next(line for line in lines if "predictions scored" in line)
+    assert int(scored.split()[0]) > 50
+
+
+def test_the_demo_leaves_a_picture_and_nothing_else(
+    demo: tuple[subprocess.CompletedProcess[str], Path],
+) -> None:
+    done, folder = demo
+    path = folder / "pictures" / "eqrt-demo-ngsim.svg"
+    assert f"picture    {path.resolve()}" in done.stdout
+    assert [found for found in folder.rglob("*") if found.is_file()] == [path]
+    assert ElementTree.parse(path).getroot().tag.endswith("svg")
+
+
+def test_a_demo_that_is_too_short_to_score_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--part", "rav4", "--seconds", "0.5", "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "no prediction could be scored" in said
+    assert "picture    none" in said
+
+
+def test_the_recordings_of_the_demo_ship_with_it() -> None:
+    for part in PARTS:
+        assert part.log.is_file()
+        assert part.tile is None or part.tile.is_file()
+
+
+def test_pictures_that_cannot_be_written_are_known_before_the_minute(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert main(["demo", "--out", str(tmp_path / "file")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"eqrt: cannot write pictures to {tmp_path / 'file'} (")
+    assert err.count("\n") == 1
