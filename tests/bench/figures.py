@@ -175,7 +175,7 @@ def service(log: Path) -> Iterator[str]:
         ):
             with playing(log, "--can", channel) as player:
                 player.wait()
-            memory = memory_mb(serving.pid)
+            memory = memory_mib(serving.pid)
             serving.end()
         latency_ms = 1e3 * np.array(latencies_s(heard.messages))
         p50, p99 = np.quantile(latency_ms, [0.5, 0.99])
@@ -185,7 +185,7 @@ def service(log: Path) -> Iterator[str]:
         )
         yield (
             f"{name:12} memory of the process after {SECONDS:.0f} s: "
-            f"{memory['VmRSS']:.1f} MB, at most {memory['VmHWM']:.1f} MB"
+            f"{memory['VmRSS']:.1f} MiB, at most {memory['VmHWM']:.1f} MiB"
         )
 
 
@@ -207,10 +207,10 @@ def latencies_s(messages: list[can.Message]) -> list[float]:
     return found
 
 
-def memory_mb(pid: int) -> dict[str, float]:
-    """VmRSS and VmHWM of a process."""
+def memory_mib(pid: int) -> dict[str, float]:
+    """VmRSS and VmHWM of a process; the kernel's kB are of 1,024 bytes."""
     text = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
-    return {key: int(kb) / 1000 for key, kb in re.findall(r"(Vm(?:RSS|HWM)):\s+(\d+) kB", text)}
+    return {key: int(kb) / 1024 for key, kb in re.findall(r"(Vm(?:RSS|HWM)):\s+(\d+) kB", text)}
 
 
 def starts(log: Path) -> Iterator[str]:

@@ -46,9 +46,9 @@ KEYS = {  # of docs/output.md
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """Four seconds of NGSIM."""
+    """The first seconds of NGSIM."""
     path = tmp_path / "drive.log"
-    path.write_text(first_seconds(NGSIM.log, 4.0))
+    path.write_text(first_seconds(NGSIM.log, 2.0))
     return path
 
 
@@ -116,7 +116,7 @@ def test_a_replay_ends_with_a_line_about_it(
     assert run(log, tmp_path / "out.jsonl") == 0
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith(f"eqrt replay: {len(log.read_text().splitlines())} messages, 40 cycles, ")
+    assert err.startswith(f"eqrt replay: {len(log.read_text().splitlines())} messages, 20 cycles, ")
     assert f", {len(lines_of(tmp_path / 'out.jsonl'))} predictions in " in err
     assert err.count("\n") == 1
 
