@@ -19,9 +19,9 @@ TABLE = re.compile(r"  (eqrt|constant velocity) +" + r" +".join([r"\d+\.\d\d"] *
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
-    """Six seconds of the first part, from an empty directory."""
+    """Seven seconds of the first part, from an empty directory."""
     folder = tmp_path_factory.mktemp("empty")
-    done = eqrt("demo", "--part", "ngsim", "--seconds", "6", "--out", "pictures", cwd=folder)
+    done = eqrt("demo", "--part", "ngsim", "--seconds", "7", "--out", "pictures", cwd=folder)
     return done, folder
 
 

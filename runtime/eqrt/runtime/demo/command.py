@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import socket
 import subprocess
@@ -192,13 +193,19 @@ def _line(result: PartResult, forecast: ForecastSet, seconds: float) -> str:
 def _forecasts(
     receiver: socket.socket, player: subprocess.Popen[str], seconds: float | None
 ) -> Iterator[ForecastSet]:
-    """What the service says, until the player has ended and what it sent is answered."""
-    end_s = None if seconds is None else time.monotonic() + seconds
-    while end_s is None or time.monotonic() < end_s:
-        if player.poll() is not None and end_s is None:
-            end_s = time.monotonic() + _SILENT_S
+    """What the service says, until the player has ended and what it sent is answered.
+
+    `seconds` count from the first prediction, however long the processes take to start.
+    """
+    end_s = math.inf
+    while time.monotonic() < end_s:
+        if player.poll() is not None:
+            end_s = min(end_s, time.monotonic() + _SILENT_S)
         with contextlib.suppress(TimeoutError):
-            yield decode_datagram(receiver.recv(65_535)).forecasts
+            forecast = decode_datagram(receiver.recv(65_535)).forecasts
+            if seconds is not None and forecast.num_targets:
+                end_s = min(end_s, time.monotonic() + seconds)
+            yield forecast
 
 
 @contextlib.contextmanager
