@@ -11,6 +11,7 @@ import importlib
 import importlib.metadata
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from eqrt.core.errors import EqrtError, UsageError
 
@@ -32,6 +33,14 @@ EXTRA_OF = {  # third-party module -> the extra that brings it
     "onnxscript": "export",
     "lanelet2": "maps",
 }
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong with the command line in one line, like every other error."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises UsageError."""
+        raise UsageError(f"{message}; see {self.prog} --help")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,7 +70,7 @@ def _run_command(name: str, argv: list[str]) -> int:
         if extra is None:
             raise
         raise missing_extra(f"eqrt {name}", error.name or "", extra) from error
-    parser = argparse.ArgumentParser(prog=f"eqrt {name}", description=summary, allow_abbrev=False)
+    parser = Parser(prog=f"eqrt {name}", description=summary, allow_abbrev=False)
     module.add_arguments(parser)
     return int(module.run(parser.parse_args(argv)))
 
@@ -77,7 +86,7 @@ def missing_extra(what: str, module: str, extra: str) -> UsageError:
 def _top_level(argv: list[str]) -> int:
     width = max(map(len, COMMANDS))
     listing = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items())
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="eqrt",
         description="Motion prediction from CAN object lists and a lane map, on a 2-core CPU.",
         epilog=f"commands:\n{listing}\n\n`eqrt COMMAND --help` says more.",

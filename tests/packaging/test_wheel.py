@@ -128,3 +128,10 @@ def test_a_command_of_the_workstation_names_its_extra(installed: Installed) -> N
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "pip install 'eqrt[train]'" in done.stderr
+
+
+def test_the_installed_command_plays_its_demo(installed: Installed, tmp_path: Path) -> None:
+    """Model, tile, profiles, DBCs and recordings are in the wheel, and work from there."""
+    done = installed.run("eqrt", "demo", "--part", "rav4", "--seconds", "2", "--out", str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "NO_MAP" in done.stdout

@@ -88,3 +88,24 @@ def test_ctrl_c_ends_with_the_shells_status(monkeypatch: pytest.MonkeyPatch) -> 
 def test_user_errors_carry_their_exit_status() -> None:
     assert cli.missing_extra("eqrt train", "torch", "train").exit_code == 2
     assert UsageError("").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["serve"], "--profile, --can; see eqrt serve --help"),
+        (["serve", "--can", "x", "--profil", "ars408"], "--profile; see eqrt serve --help"),
+        (["serve", "--can", "x", "--profile", "ars408", "--out-id", "z"], "not a CAN id"),
+        (["replay", "a.log", "--profile", "ars408"], "--out; see eqrt replay --help"),
+        (["tile", "build"], "SOURCE, --out; see eqrt tile build --help"),
+        (["play", "a.log", "--can", "x", "--fast"], "--fast; see eqrt play --help"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_too(
+    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(argv) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("eqrt: ")
+    assert error.count("\n") == 1
+    assert said in error

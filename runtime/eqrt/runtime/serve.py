@@ -17,7 +17,7 @@ from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.decoding.profile import Profile, builtin_profiles, load_profile
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS, DatagramPublisher
-from eqrt.runtime.output.publish_can import CanPublisher
+from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.prediction.tiles import load_tile
@@ -59,6 +59,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{NO_CHANNEL!r} = not on CAN",
     )
     parser.add_argument(
+        "--out-id",
+        type=_arbitration_id,
+        default=BASE_ID,
+        metavar="ID",
+        help=f"the first CAN id of the predictions (default {BASE_ID:#x})",
+    )
+    parser.add_argument(
+        "--out-modes",
+        type=int,
+        default=1,
+        metavar="N",
+        help="modes of each object sent on CAN FD, most probable first (default 1)",
+    )
+    parser.add_argument(
         "--datagrams",
         action="append",
         default=[],
@@ -67,6 +81,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{DEFAULT_ADDRESS} (repeatable)",
     )
     parser.add_argument("--quiet", action="store_true", help="no status line every second")
+
+
+def _arbitration_id(text: str) -> int:
+    """A CAN id, decimal or with 0x."""
+    try:
+        return int(text, 0)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a CAN id such as 0x6e0") from error
 
 
 def add_pipeline_arguments(parser: argparse.ArgumentParser) -> None:
@@ -210,7 +232,7 @@ def _publishers(
             bus = stack.enter_context(
                 open_bus(channel, args.can_interface, fd=args.fd, receive_ids=[])
             )
-        publishers.append(CanPublisher(bus))
+        publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
     elif not args.datagrams:
         raise UsageError("--out-can none and no --datagrams: the predictions would go nowhere")
     if args.datagrams:

@@ -64,7 +64,8 @@ PARTS = (
         name="rav4",
         about=(
             "Raw CAN of a Toyota RAV4 on a motorway (comma2k19): its radar, wheel speeds and yaw\n"
-            "rate, as the car sent them. No map; most radar tracks live less than a second."
+            "rate, as the car sent them. No map; most radar tracks live less than a second,\n"
+            "and the model has never been trained on a radar: this is what it is worth there."
         ),
         log=DATA / "rav4.log.gz",
         serve=("--profile", "toyota-rav4"),
