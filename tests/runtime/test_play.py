@@ -75,11 +75,12 @@ def test_a_log_is_sent_whole_and_in_order(ear: Ear) -> None:
 def test_messages_keep_their_distances(speed: float, ear: Ear) -> None:
     """No message is early; none is later than the machine makes it."""
     times_s = [100.0, 100.05, 100.05, 100.3]
+    began_s = time.time()
     Player({OTHERS: ear.bus}, speed).play(at(*times_s), never)
     sent_s = [message.timestamp for message in ear.heard()]
     for sent, recorded_s in zip(sent_s, times_s, strict=True):
         due_s = (recorded_s - 100.0) / speed
-        assert due_s - CLOCKS_S < sent - sent_s[0] < due_s + SLACK_S
+        assert due_s - CLOCKS_S < sent - began_s < due_s + SLACK_S
 
 
 def test_lateness_does_not_add_up(ear: Ear) -> None:
@@ -91,11 +92,12 @@ def test_lateness_does_not_add_up(ear: Ear) -> None:
                 time.sleep(0.5)
             yield message
 
+    began_s = time.time()
     player = Player({OTHERS: ear.bus})
     player.play(slow(), never)
-    start_s, *sent_s = (message.timestamp for message in ear.heard())
-    for sent, due_s in zip(sent_s, (0.5, 0.5, 0.7), strict=True):
-        assert due_s - CLOCKS_S < sent - start_s < due_s + SLACK_S
+    sent_s = [message.timestamp for message in ear.heard()]
+    for sent, due_s in zip(sent_s, (0.0, 0.5, 0.5, 0.7), strict=True):
+        assert due_s - CLOCKS_S < sent - began_s < due_s + SLACK_S
     assert player.latest_s > 0.4
 
 
@@ -119,22 +121,24 @@ def test_a_clock_that_was_set_is_not_waited_for(ear: Ear) -> None:
 
 def test_a_stamp_slightly_out_of_order_moves_nothing(ear: Ear) -> None:
     """Recorders with several buses write such; the message is sent at once."""
+    began_s = time.time()
     player = Player({OTHERS: ear.bus})
     player.play(at(0.0, 0.1, 0.09, 0.2), never)
-    first, second, third, last = (message.timestamp for message in ear.heard())
-    assert third - second < 0.05
-    assert 0.2 - CLOCKS_S < last - first < 0.2 + SLACK_S
+    _, second, third, last = (message.timestamp for message in ear.heard())
+    assert third - second < 0.1  # at once, as fast as a busy machine lets it
+    assert 0.2 - CLOCKS_S < last - began_s < 0.2 + SLACK_S
     assert "jump" not in player.summary()
 
 
 def test_a_log_played_again_keeps_its_distances(ear: Ear) -> None:
     """The first message of the second time is due with the last one of the first time."""
+    began_s = time.time()
     player = Player({OTHERS: ear.bus})
     player.play(at(7.0, 7.1), never)
     player.play(at(7.0, 7.1), never)
     sent_s = [message.timestamp for message in ear.heard()]
     for sent, due_s in zip(sent_s, (0.0, 0.1, 0.1, 0.2), strict=True):
-        assert due_s - CLOCKS_S < sent - sent_s[0] < due_s + SLACK_S
+        assert due_s - CLOCKS_S < sent - began_s < due_s + SLACK_S
 
 
 def test_log_channels_go_where_they_are_sent(ear: Ear) -> None:
