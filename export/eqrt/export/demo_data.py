@@ -9,6 +9,7 @@ import argparse
 import gzip
 import itertools
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from eqrt.export import encode
@@ -24,13 +25,13 @@ SCENARIOS = (  # a minute: motorway, arterial, motorway, arterial ...
 RAV4_S = 30.0
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Write ngsim.log.gz, ngsim.tile and rav4.log.gz."""
     parser = argparse.ArgumentParser(prog="python -m eqrt.export.demo_data", description=__doc__)
     parser.add_argument("ngsim", type=Path, help="folder of CommonRoad scenarios")
     parser.add_argument("rav4", type=Path, help="candump log, gzip'd")
     parser.add_argument("out", type=Path)
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     encoder = argparse.ArgumentParser()
     encode.add_arguments(encoder)
     scenarios = [str(args.ngsim / f"{name}.xml.gz") for name in SCENARIOS]
