@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from eqrt.core.routes import RouteFinder
-from eqrt.training.commonroad import lane_map, read_scenario
+from eqrt.training.recordings.commonroad import lane_map, read_scenario
 
 JUNCTION = Path(__file__).parents[1] / "data/ngsim/USA_Lanker-2_23_T-1.xml.gz"
 BUDGET_S = 0.004  # for 32 targets, at the median, on two cores

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from eqrt.core.frames import Pose2
 from eqrt.core.lanes import Lane, LaneMap, build_lane_map, middle_line
 from eqrt.core.routes import RouteFinder
-from eqrt.training.commonroad import Scenario, lane_map, read_scenario
+from eqrt.training.recordings.commonroad import Scenario, lane_map, read_scenario
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]

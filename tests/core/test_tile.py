@@ -17,7 +17,7 @@ from eqrt.core.errors import TileError
 from eqrt.core.lanes import NO_LANE, Lane, LaneMap, LaneType, build_lane_map, middle_line
 from eqrt.core.routes import RouteFinder
 from eqrt.core.tile import TileInfo, decode, encode
-from eqrt.training.commonroad import lane_map, read_scenario
+from eqrt.training.recordings.commonroad import lane_map, read_scenario
 
 NGSIM = Path(__file__).parents[1] / "data/ngsim"
 INFO = TileInfo(

@@ -22,42 +22,42 @@ from eqrt.export.artifact import write_artifact
 from eqrt.export.to_onnx import FORBIDDEN_OPS, IR_VERSION, OPSET, to_onnx
 from eqrt.export.vectors import move, named_scenes, nan_where_invalid
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
-from eqrt.training.checkpoint import Card, load_checkpoint, save_checkpoint
-from eqrt.training.config import ModelConfig
-from eqrt.training.model import EquivariantPredictor
+from eqrt.training.checkpoint import Card
+from eqrt.training.networks.compact import CompactConfig, CompactPredictor
+from eqrt.training.networks.config import SceneConfig
 from poses import random_pose
 
-CONFIG = ModelConfig(
+SCENE = SceneConfig(
     num_agents=4,
     history_steps=20,
     num_centerlines=4,
     centerline_points=10,
+    lane_choice="routes",
     horizon_steps=30,
     num_modes=3,
     dt_s=0.1,
-    layers=2,
-    channels=8,
-    width=16,
-    categories=2,
-    token_width=8,
-    heads=2,
-    pointers=2,
-    dropout=0.1,
 )
+NETWORK = CompactConfig(width=16, heads=2, layers=1, decoder_layers=1, dropout=0.1)
 CARD = Card(
     name="test",
     data="made up",
     license="Apache-2.0",
+    non_commercial=True,
     metrics={"ade_3s": 1.0},
     baseline={"ade_3s": 2.0},
+    command="eqrt train",
+    config_sha256="0" * 64,
+    parameters=12,
+    steps=3,
+    seed=1,
 )
 
 
 @pytest.fixture(scope="module")
-def model() -> EquivariantPredictor:
+def model() -> CompactPredictor:
     """Three modes, and random weights also where training starts from zero."""
     torch.manual_seed(5)
-    model = EquivariantPredictor(CONFIG).eval()
+    model = CompactPredictor(SCENE, NETWORK).eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
@@ -65,9 +65,9 @@ def model() -> EquivariantPredictor:
 
 
 @pytest.fixture(scope="module")
-def artifact(model: EquivariantPredictor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def artifact(model: CompactPredictor, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export") / "artifact"
-    assert write_artifact(model, CONFIG.contract("test", "1.2.3"), CARD, folder) < 1e-3
+    assert write_artifact(model, SCENE.contract("test", "1.2.3"), CARD, folder) < 1e-3
     return folder
 
 
@@ -152,12 +152,19 @@ def test_the_contract_is_in_the_file_and_beside_it(artifact: Path) -> None:
     beside = (artifact / "contract.json").read_text(encoding="utf-8")
     assert json.loads(inside[METADATA_KEY]) == json.loads(beside)
     contract = ModelContract.from_json(beside, "contract.json")
-    assert contract == CONFIG.contract("test", "1.2.3")
+    assert contract == SCENE.contract("test", "1.2.3")
     assert inside["license"] == "Apache-2.0"
+    assert inside["non_commercial"] == "true"
 
 
-def test_the_same_network_exports_to_the_same_bytes(model: EquivariantPredictor) -> None:
-    contract = CONFIG.contract("test", "1.2.3")
+def test_the_runtime_says_when_a_model_may_not_be_sold(artifact: Path, shipped: Predictor) -> None:
+    notice = Predictor.load(artifact).licence_notice
+    assert notice == "model licence: Apache-2.0, non-commercial (test)"
+    assert shipped.licence_notice is None
+
+
+def test_the_same_network_exports_to_the_same_bytes(model: CompactPredictor) -> None:
+    contract = SCENE.contract("test", "1.2.3")
     assert to_onnx(model, contract, {}) == to_onnx(model, contract, {})
 
 
@@ -171,7 +178,7 @@ def test_test_vectors_are_what_the_reference_evaluator_computes(artifact: Path) 
 
     evaluator = ReferenceEvaluator(onnx.load(artifact / "model.onnx"))
     for folder in sorted(artifact.glob("test_data_set_*")):
-        names = list(CONFIG.contract("test", "1.2.3").inputs)
+        names = list(SCENE.contract("test", "1.2.3").inputs)
         feed = dict(zip(names, stored(folder, "input", 5), strict=True))
         found = list(evaluator.run(None, feed))
         trajectories, probabilities = stored(folder, "output", 2)
@@ -273,29 +280,11 @@ def test_a_damaged_artifact_is_refused_in_one_line(copy: Path, damage, said: str
 
 
 def test_a_failed_export_leaves_the_old_artifact_alone(
-    model: EquivariantPredictor, copy: Path, monkeypatch: pytest.MonkeyPatch
+    model: CompactPredictor, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = (copy / "SHA256SUMS").read_bytes()
     monkeypatch.setattr("eqrt.export.artifact.AGREEMENT_M", -1.0)  # nothing agrees that well
     with pytest.raises(EqrtError, match="differ"):
-        write_artifact(model, CONFIG.contract("test", "2.0.0"), CARD, copy)
+        write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy)
     assert (copy / "SHA256SUMS").read_bytes() == before
     assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]
-
-
-def test_a_checkpoint_comes_back_as_it_was(model: EquivariantPredictor, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "m.safetensors", model, CARD)
-    loaded, card = load_checkpoint(tmp_path / "m.safetensors")
-    assert card == CARD
-    assert loaded.config == CONFIG
-    for name, tensor in model.state_dict().items():
-        torch.testing.assert_close(loaded.state_dict()[name], tensor, rtol=0, atol=0)
-
-
-def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(EqrtError, match="no such checkpoint"):
-        load_checkpoint(tmp_path / "missing.safetensors")
-    (tmp_path / "bad.safetensors").write_bytes(b"nothing of the kind")
-    with pytest.raises(EqrtError, match="not a checkpoint") as refused:
-        load_checkpoint(tmp_path / "bad.safetensors")
-    assert "\n" not in str(refused.value)

@@ -18,8 +18,9 @@ from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Prediction, Predictor
 from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.replay import replay
-from eqrt.training.commonroad import Scenario, lane_map, read_scenario
-from eqrt.training.data import TrackGrid
+from eqrt.training.recordings.commonroad import Scenario, lane_map, read_scenario
+from eqrt.training.recordings.commonroad_recordings import track_grid
+from eqrt.training.recordings.recording import TrackGrid
 
 NGSIM = Path(__file__).parent.parent / "data" / "ngsim"
 RANGE_M = 80.0
@@ -51,7 +52,7 @@ def scenes_from_can(scenario: Scenario) -> list[Scene]:
     lanes = lane_map(scenario)
     _, info = decode(encode(lanes, TileInfo(name="t", source="t", credit="")), "t")
     predictor = Listening(Predictor.load(DEFAULT_ARTIFACT))
-    pipeline = Pipeline(load_profile("generic"), predictor, Tile(lanes, RouteFinder(lanes), info))  # type: ignore[arg-type]  # listens, else the same
+    pipeline = Pipeline(load_profile("generic"), predictor, Tile(lanes, info))  # type: ignore[arg-type]  # listens, else the same
     forecasts = list(replay(pipeline, drive_messages([scenario], RANGE_M)))
     assert len(forecasts) == len(choose_ego(scenario).step)
     assert all(forecast.num_targets for forecast in forecasts[1:])
@@ -60,7 +61,7 @@ def scenes_from_can(scenario: Scenario) -> list[Scene]:
 
 def scene_directly(scenario: Scenario, step: int, contract: ModelContract, origin: np.ndarray):  # type: ignore[no-untyped-def]
     """What the ego could have seen, straight from the recording."""
-    grid = TrackGrid.of(scenario)
+    grid = track_grid(scenario, "test")
     ego = scenario.tracks.index(choose_ego(scenario))
     distance = np.linalg.norm(grid.positions - grid.positions[ego], axis=-1)
     visible = grid.valid & (distance <= RANGE_M) & grid.valid[ego]

@@ -12,6 +12,7 @@ import pytest
 from eqrt.cli import main
 from eqrt.core.errors import TileError
 from eqrt.core.lanes import Lane, build_lane_map, middle_line
+from eqrt.core.routes import RouteFinder
 from eqrt.core.tile import TileInfo, encode
 from eqrt.runtime.prediction.tiles import load_tile, save_tile
 
@@ -22,13 +23,13 @@ TILE = encode(
 )
 
 
-def test_a_saved_tile_loads_and_finds_routes(tmp_path: Path) -> None:
+def test_a_saved_tile_loads_and_its_routes_are_found(tmp_path: Path) -> None:
     path = tmp_path / "straight.tile"
     save_tile(path, TILE)
     tile = load_tile(path)
     assert tile.info.name == "straight"
     assert tile.lane_map.lane_id.tolist() == [5]
-    points, valid = tile.routes.centerlines(np.array([500.0, 1.0]), None, 2, 3)
+    points, valid = RouteFinder(tile.lane_map).centerlines(np.array([500.0, 1.0]), None, 2, 3)
     assert points[0].tolist() == [[490.0, 0.0], [540.0, 0.0], [590.0, 0.0]]
     assert valid.tolist() == [[True] * 3, [False] * 3]
 

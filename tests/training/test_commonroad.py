@@ -12,7 +12,7 @@ import pytest
 
 from eqrt.core.errors import LogError
 from eqrt.core.lanes import NO_LANE, LaneType
-from eqrt.training.commonroad import lane_map, read_scenario
+from eqrt.training.recordings.commonroad import lane_map, read_scenario
 
 NGSIM = Path(__file__).parents[1] / "data/ngsim"
 

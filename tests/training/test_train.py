@@ -1,9 +1,8 @@
-"""The training loop, on real recordings, for a few steps."""
+"""The training loop and its command, on real recordings, for a few steps."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,111 +11,238 @@ import pytest
 import torch
 
 from eqrt.cli import main
-from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.errors import EqrtError
 from eqrt.training.checkpoint import load_checkpoint
-from eqrt.training.data import load_windows
-from eqrt.training.evaluate import evaluate, evaluate_constant_velocity, predict
-from eqrt.training.losses import best_mode_loss, mode_displacement
-from eqrt.training.train import load_config, schedule, train
+from eqrt.training.configuration import TrainConfig, load_config
+from eqrt.training.dataset.store import open_data
+from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity, predict
+from eqrt.training.networks.registry import build_network
+from eqrt.training.sampling import Pool
+from eqrt.training.state import new_optimizer, new_state, update_average
+from eqrt.training.train import learning_rate, train, train_step
+from eqrt.training.training_data import TrainingData
 from source_tree import ROOT
+from tiny_training import DATA, NGSIM, TOML, tiny, tiny_data, tiny_file
+from window_samples import packed_scenes
 
-NGSIM = ROOT / "tests/data/ngsim"
-CONFIG_FILE = ROOT / "training/configs/eqrt-ngsim.toml"
-CONFIG = load_config(CONFIG_FILE)
+SHIPPED = load_config(ROOT / "training/configs/eqrt-ngsim.toml")
+
+
+def command(config: Path, out: Path, *more: str, data: tuple[Path, ...] = DATA) -> list[str]:
+    sources = [word for path in data for word in ("--data", str(path))]
+    return ["train", "--config", str(config), *sources, "--out", str(out), *more]
+
+
+def run_tiny(out: Path, config: TrainConfig, steps: int) -> torch.nn.Module:
+    return train(config.with_steps(steps), tiny_data(), out).average
 
 
 def test_training_beats_constant_velocity_on_what_it_saw(tmp_path: Path) -> None:
     """A hundred steps on eight seconds of motorway."""
-    contract = CONFIG.model.contract("test", "0.0.0")
-    windows = load_windows([NGSIM / "USA_US101-15_1_T-1.xml.gz"], contract, stride=3)
-    loop = replace(CONFIG.train, evaluate_every=1000, batch_size=32, average_decay=0.9)
-    model = train(replace(CONFIG, train=loop), windows, windows, 100, tmp_path)
-    learned = evaluate(model, windows)
-    course = evaluate_constant_velocity(windows, CONFIG.model.dt_s)
-    assert learned["ade_3s"] < 0.95 * course["ade_3s"]
+    scene = SHIPPED.model.scene
+    store = open_data(
+        NGSIM / "USA_US101-15_1_T-1.xml.gz",
+        scene.contract("test", "0.0.0"),
+        options=SHIPPED.data.window_options(),
+    )
+    windows = store.gather(store.rows())
+    loop = replace(SHIPPED.train, steps=100, batch_size=32, average_decay=0.9)
+    data = TrainingData(Pool.of(windows), windows, store.source)
+    model = train(replace(SHIPPED, train=loop), data, tmp_path).average
+    course = evaluate_constant_velocity(windows, scene.num_modes, scene.dt_s)
+    assert evaluate(model, windows, scene.dt_s)["ade_3s"] < 0.95 * course["ade_3s"]
     assert np.isfinite(predict(model, windows)).all()
 
 
-def test_the_same_seed_trains_the_same_network(tmp_path: Path) -> None:
-    contract = CONFIG.model.contract("test", "0.0.0")
-    windows = load_windows([NGSIM / "USA_Peach-4_8_T-1.xml.gz"], contract, stride=3)
-    loop = replace(CONFIG.train, batch_size=16)
-    models = [train(replace(CONFIG, train=loop), windows, windows, 3, tmp_path) for _ in range(2)]
-    for one, other in zip(models[0].parameters(), models[1].parameters(), strict=True):
-        assert torch.equal(one, other)
+def test_the_same_seed_trains_the_same_network_and_another_seed_another(tmp_path: Path) -> None:
+    configs = [tiny(), tiny(), tiny({"train": {"seed": 2}})]
+    one, same, other = (run_tiny(tmp_path, config, 3).state_dict() for config in configs)
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_the_command_writes_a_checkpoint_that_says_where_it_comes_from(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = tmp_path / "data"
-    data.mkdir()
-    for name in (*CONFIG.data.held_out[-1:], "USA_Lanker-1_1_T-1"):
-        shutil.copy(NGSIM / f"{name}.xml.gz", data)
-    text = CONFIG_FILE.read_text(encoding="utf-8")
-    start, end = text.index("held_out = ["), text.index("]\nstride")
-    config = tmp_path / "config.toml"
-    config.write_text(text[:start] + f'held_out = ["{CONFIG.data.held_out[-1]}"' + text[end:])
-    out = tmp_path / "out"
-    args = ["train", "--config", config, "--data", data, "--out", out, "--steps", "2"]
-    assert main([str(arg) for arg in args]) == 0
-    model, card = load_checkpoint(out / "model.safetensors")
-    assert model.config == CONFIG.model
+    config, out = tiny_file(tmp_path), tmp_path / "out"
+    assert main(command(config, out, "--steps", "4")) == 0
+    checkpoint = load_checkpoint(out / "model.safetensors")
+    card = checkpoint.card
+    assert checkpoint.config == tiny().model
+    assert "NGSIM" in card.data
     assert card.license == "CC-BY-SA-4.0"
+    assert not card.non_commercial
     assert card.metrics.keys() == card.baseline.keys()
     assert card.metrics["fde_3s"] > 0.0
-    (line,) = (out / "metrics.jsonl").read_text().splitlines()
-    assert json.loads(line)["step"] == 2
-    assert "constant velocity" in capsys.readouterr().out
+    assert (card.steps, card.seed) == (4, 1)
+    assert card.config_sha256 == tiny().with_steps(4).sha256
+    assert card.command.startswith(f"eqrt train --config {config} --data {DATA[0]} --data ")
+    assert card.parameters == sum(p.numel() for p in checkpoint.network.parameters())
+    said = capsys.readouterr().out
+    assert "constant velocity" in said
+    assert "loader " in said
+    assert "NON-COMMERCIAL" not in said.upper()
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (("seed = 1", "sead = 1"), r"\[train\].*sead"),
-        (("heads = 2", ""), r"\[model\].*heads"),
-        (('name = "eqrt-ngsim"', "name ="), "not TOML"),
-    ],
-)
-def test_a_wrong_configuration_names_the_file_and_the_field(
-    tmp_path: Path, change: tuple[str, str], said: str
+def test_the_checkpoint_predicts_what_was_evaluated(tmp_path: Path) -> None:
+    assert main(command(tiny_file(tmp_path), tmp_path / "out", "--steps", "4")) == 0
+    checkpoint = load_checkpoint(tmp_path / "out" / "model.safetensors")
+    again = evaluate(checkpoint.network, tiny_data().held_out, checkpoint.config.scene.dt_s)
+    assert again == checkpoint.card.metrics
+
+
+def test_metrics_stand_in_a_line_per_evaluation_and_in_pictures(tmp_path: Path) -> None:
+    evaluated = ("evaluate_every = 25", "evaluate_every = 2")
+    assert main(command(tiny_file(tmp_path, evaluated), tmp_path / "out", "--steps", "5")) == 0
+    text = (tmp_path / "out" / "metrics.jsonl").read_text(encoding="utf-8")
+    lines = [json.loads(line) for line in text.splitlines()]
+    assert [line["step"] for line in lines] == [2, 4, 5]
+    assert all(
+        {"loss", "learning_rate", "samples_per_s", "ade_3s"} <= line.keys() for line in lines
+    )
+    for name in ("loss", "errors"):
+        assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert b"<svg" in (tmp_path / "out" / f"{name}.svg").read_bytes()
+
+
+def test_data_that_may_not_be_sold_says_so_while_training_and_in_the_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "wrong.toml"
-    path.write_text(CONFIG_FILE.read_text(encoding="utf-8").replace(*change), encoding="utf-8")
-    with pytest.raises(EqrtError, match=said) as refused:
-        load_config(path)
-    assert str(path) in str(refused.value)
+    """Together with data that may: the strictest terms count, and all credits stand."""
+    config = tiny_file(tmp_path, ('held_out = ["USA_Peach-2"]', 'held_out = ["USA_Peach-2", "1"]'))
+    scenes = packed_scenes(tmp_path / "scenes.npz", 4)
+    data = (*DATA, scenes)
+    assert main(command(config, tmp_path / "out", "--steps", "1", data=data)) == 0
+    assert "non-commercial" in capsys.readouterr().out
+    card = load_checkpoint(tmp_path / "out" / "model.safetensors").card
+    assert card.non_commercial
+    assert "NGSIM" in card.data
+    assert "Argoverse" in card.data
+    assert "AND" in card.license
 
 
-def test_a_missing_configuration_is_a_usage_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such configuration"):
-        load_config(tmp_path / "missing.toml")
+def test_a_folder_with_a_training_in_it_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = command(tiny_file(tmp_path), tmp_path / "out", "--steps", "1")
+    assert main(words) == 0
+    before = (tmp_path / "out" / "model.safetensors").read_bytes()
+    assert main(words) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert (tmp_path / "out" / "model.safetensors").read_bytes() == before
 
 
-def test_held_out_recordings_that_are_not_there_are_named(tmp_path: Path) -> None:
-    shutil.copy(NGSIM / "USA_Lanker-1_1_T-1.xml.gz", tmp_path)
-    args = ["train", "--config", CONFIG_FILE, "--data", tmp_path, "--out", tmp_path / "out"]
-    assert main([str(arg) for arg in args]) == 1
+def test_held_out_recordings_that_are_not_there_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(tiny_file(tmp_path), tmp_path / "out", data=DATA[:1])) == 1
+    assert "USA_Peach-2 is not here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_the_schedule_warms_up_and_comes_down_to_nothing() -> None:
-    assert schedule(0, 100, 10) == pytest.approx(0.1)
-    assert schedule(10, 100, 10) == pytest.approx(1.0)
-    assert schedule(55, 100, 10) == pytest.approx(0.5)
-    assert schedule(100, 100, 10) == pytest.approx(0.0)
+@pytest.mark.parametrize("option", ["--steps", "--threads", "--loader-threads"])
+def test_numbers_below_one_are_refused(tmp_path: Path, option: str) -> None:
+    assert main(command(tiny_file(tmp_path), tmp_path / "out", option, "0")) == 2
 
 
-def test_the_loss_is_the_displacement_of_the_best_mode_over_the_seen_steps() -> None:
-    """Two modes, one 3 m off at every step, one 5 m off; the second half was not seen."""
-    future = torch.zeros(1, 4, 2)
-    valid = torch.tensor([[True, True, False, False]])
-    modes = torch.zeros(1, 2, 4, 2)
-    modes[0, 0, :, 0], modes[0, 1, :, 1] = 3.0, 5.0
-    modes[0, 0, 2:] = 1000.0
-    distance = mode_displacement(modes, future, valid)
-    torch.testing.assert_close(distance, torch.tensor([[3.0, 5.0]]))
-    sure = best_mode_loss(modes, torch.tensor([[1.0, 0.0]]), future, valid)
-    torch.testing.assert_close(sure, torch.tensor(3.0))
-    unsure = best_mode_loss(modes, torch.tensor([[0.5, 0.5]]), future, valid)
-    torch.testing.assert_close(unsure, torch.tensor(3.0 + 0.5 * float(np.log(2.0))))
+@pytest.mark.skipif(torch.cuda.is_available(), reason="only where there is no such device")
+def test_a_device_that_is_not_there_is_a_usage_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(tiny_file(tmp_path), tmp_path / "out", "--device", "cuda")) == 2
+    assert "no CUDA device" in capsys.readouterr().err
+
+
+def test_a_loss_that_is_no_number_ends_it_and_leaves_what_was_good(tmp_path: Path) -> None:
+    """Step 7 meets a window with a NaN among its futures."""
+    windows = tiny_data().held_out
+    future = windows.future.copy()
+    config = tiny({"train": {"evaluate_every": 5, "batch_size": len(windows)}})
+    config = replace(config, augment=None)
+    good = TrainingData(Pool.of(windows), windows, tiny_data().source)
+    train(config.with_steps(5), good, tmp_path)
+    before = (tmp_path / "state.safetensors").read_bytes()
+    future[3, 7] = np.nan
+    bad = TrainingData(Pool.of(replace(windows, future=future)), windows, tiny_data().source)
+    with pytest.raises(EqrtError, match=r"broke down at step 1: loss nan") as refused:
+        train(config.with_steps(5), bad, tmp_path)
+    assert "\n" not in str(refused.value)
+    assert (tmp_path / "state.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize("loss", ["ade", "best_mode"])
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+def test_every_loss_and_optimizer_trains(tmp_path: Path, loss: str, optimizer: str) -> None:
+    config = tiny({"train": {"loss": loss, "optimizer": optimizer}})
+    before = new_state(config, torch.device("cpu")).average.state_dict()
+    after = run_tiny(tmp_path, config, 2).state_dict()
+    assert any(not torch.equal(before[name], after[name]) for name in before)
+
+
+def test_modes_beyond_the_first_are_measured_too(tmp_path: Path) -> None:
+    config = tiny({"scene": {"num_modes": 3}})
+    metrics = evaluate(run_tiny(tmp_path, config, 2), tiny_data().held_out, 0.1)
+    assert {"min_ade", "min_fde", "miss_rate"} < metrics.keys()
+    assert metrics["min_fde"] <= metrics["fde_3s"]
+
+
+def test_in_bf16_the_loss_is_float32_and_close(tmp_path: Path) -> None:
+    config = tiny({"train": {"precision": "bf16"}, "network": {"dropout": 0.0}})
+    windows = tiny_data().held_out.tensors()
+    losses = []
+    for precision in ("float32", "bf16"):
+        state = new_state(config, torch.device("cpu"))
+        loop = replace(config.train, precision=precision)
+        loss, _ = train_step(state.network, state.optimizer, windows, loop)
+        assert loss.dtype == torch.float32
+        losses.append(loss.item())
+    assert losses[0] != losses[1]
+    assert losses[1] == pytest.approx(losses[0], rel=0.05)
+    assert np.isfinite(evaluate(run_tiny(tmp_path, config, 2), tiny_data().held_out, 0.1)["ade_3s"])
+
+
+def test_the_learning_rate_warms_up_and_comes_down_to_nothing() -> None:
+    loop = replace(tiny().train, learning_rate=2.0, warmup_steps=10)
+    rates = [learning_rate(loop, step, 100) for step in (0, 10, 55, 100)]
+    assert rates == pytest.approx([0.2, 2.0, 1.0, 0.0])
+    steady = replace(loop, schedule="constant")
+    assert [learning_rate(steady, step, 100) for step in (0, 10, 99)] == [0.2, 2.0, 2.0]
+
+
+def test_weight_decay_is_for_matrices_only() -> None:
+    network = build_network(tiny().model)
+    decayed, spared = new_optimizer(network, tiny().train).param_groups
+    assert decayed["weight_decay"] == 0.05
+    assert all(weight.dim() >= 2 for weight in decayed["params"])
+    assert spared["weight_decay"] == 0.0
+    assert all(weight.dim() < 2 for weight in spared["params"])
+    both = len(decayed["params"]) + len(spared["params"])
+    assert both == len(list(network.parameters()))
+
+
+def test_the_average_follows_weights_and_buffers() -> None:
+    """Half the way for numbers; counters are what they are."""
+    mean, new = torch.nn.BatchNorm1d(2), torch.nn.BatchNorm1d(2)
+    torch.nn.init.constant_(new.weight, 3.0)
+    new.running_mean = torch.tensor([4.0, 8.0])
+    new.num_batches_tracked = torch.tensor(7)
+    update_average(mean, new, 0.5)
+    assert mean.weight.tolist() == [2.0, 2.0]
+    assert mean.running_mean is not None
+    assert mean.running_mean.tolist() == [2.0, 4.0]
+    assert mean.num_batches_tracked == 7
+    update_average(mean, new, 0.0)
+    assert mean.weight.tolist() == [3.0, 3.0]
+
+
+def test_inputs_are_the_contracts() -> None:
+    assert tuple(tiny().model.scene.contract("test", "0.0.0").inputs) == INPUTS
+
+
+def test_epochs_count_what_is_drawn() -> None:
+    """64 windows of which half are drawn, in batches of 16, for three epochs: six steps."""
+    text = TOML.replace("steps = 100", "epochs = 3", 1)
+    assert "epochs" in text
+    loop = replace(tiny().train, steps=None, epochs=3.0)
+    assert loop.total_steps(32) == 6
+    assert replace(loop, epochs=0.1).total_steps(32) == 1

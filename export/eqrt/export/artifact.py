@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -36,7 +37,11 @@ def write_artifact(model: nn.Module, contract: ModelContract, card: Card, folder
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
         draft = Path(temporary) / folder.name
         draft.mkdir()
-        metadata = {"data": card.data, "license": card.license}
+        metadata = {
+            "data": card.data,
+            "license": card.license,
+            "non_commercial": str(card.non_commercial).lower(),
+        }
         (draft / "model.onnx").write_bytes(to_onnx(model, contract, metadata))
         (draft / "contract.json").write_text(contract.to_json() + "\n", encoding="utf-8")
         (draft / "README.md").write_text(_model_card(contract, card), encoding="utf-8")
@@ -85,6 +90,22 @@ def _write_vector(model: nn.Module, scene: Scene, folder: Path, name: str) -> No
     (folder / "name.txt").write_text(name + "\n", encoding="utf-8")
 
 
+def _metric(name: str) -> str:
+    """How a table calls a metric: `ade_3s` is ADE 3 s."""
+    if of_mean := re.fullmatch(r"(ade|fde)_(\d+)s", name):
+        return f"{of_mean[1].upper()} {of_mean[2]} s"
+    return {"min_ade": "minADE", "min_fde": "minFDE", "miss_rate": "miss rate, share"}[name]
+
+
+def _what_counts(contract: ModelContract) -> str:
+    if contract.num_modes == 1:
+        return "mean and final displacement of the trajectory"
+    return (
+        "ADE and FDE of the most probable trajectory; minADE, minFDE and miss rate of the best of "
+        f"{contract.num_modes}"
+    )
+
+
 def _write_tensor(path: Path, name: str, value: NDArray[Any]) -> None:
     proto = onnx.numpy_helper.from_array(np.ascontiguousarray(value), name)
     path.write_bytes(proto.SerializeToString(deterministic=True))
@@ -102,7 +123,7 @@ def _write_checksums(folder: Path) -> None:
 
 def _model_card(contract: ModelContract, card: Card) -> str:
     rows = "".join(
-        f"| {name.replace('_', ' ').upper()} | {value:.3f} m | {card.baseline[name]:.3f} m |\n"
+        f"| {_metric(name)} | {value:.3f} | {card.baseline[name]:.3f} |\n"
         for name, value in card.metrics.items()
     )
     tensors = "".join(
@@ -118,11 +139,14 @@ centerlines around it become {modes} of {contract.horizon_steps * contract.dt_s:
 | | |
 | --- | --- |
 | data | {card.data} |
-| licence of the weights | {card.license} |
+| licence of the weights | {card.license}{", non-commercial" if card.non_commercial else ""} |
+| parameters | {card.parameters} |
+| trained by | `{card.command}`, {card.steps} steps, seed {card.seed} |
+| its configuration | SHA-256 {card.config_sha256[:16]} |
 | contract | version 1, `contract.json` |
 | check | `sha256sum -c SHA256SUMS`; `test_data_set_*` hold inputs and expected outputs |
 
-Errors of the most probable trajectory on held-out recordings:
+Errors on held-out recordings, metres ({_what_counts(contract)}):
 
 | metric | this model | constant velocity |
 | --- | --- | --- |
@@ -133,7 +157,6 @@ Errors of the most probable trajectory on held-out recordings:
 All positions are metres in one local frame (x east, y north) whose origin lies within 1 km of the
 car; turning or shifting that frame turns or shifts the prediction and nothing else.
 
-Limits: trained on vehicles on US motorways and urban arterials, seen from above; not on
-pedestrians or cyclists, nor on other countries' roads. It predicts what usually happens; it is no
-guarantee of what will.
+Limits: it knows vehicles on roads like those in its data; not pedestrians or cyclists, nor other
+countries' roads. It predicts what usually happens; it is no guarantee of what will.
 """

@@ -18,14 +18,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export, verify, and say what was written."""
-    model, card = load_checkpoint(args.checkpoint)
-    contract = model.config.contract(card.name, args.model_version)
+    checkpoint = load_checkpoint(args.checkpoint)
+    model, card = checkpoint.network, checkpoint.card
+    contract = checkpoint.config.scene.contract(card.name, args.model_version)
     error = write_artifact(model, contract, card, args.out)
     size = (args.out / "model.onnx").stat().st_size
-    parameters = sum(parameter.numel() for parameter in model.parameters())
     print(f"artifact       {args.out}")
-    print(f"model          {contract.name} {contract.version}, {parameters} parameters")
+    print(f"model          {contract.name} {contract.version}, {card.parameters} parameters")
     print(f"model.onnx     {size / 1e6:.2f} MB")
     print(f"verified       PyTorch and the file agree within {1e3 * error:.3f} mm on every vector")
-    print(f"licence        {card.license}")
+    limits = ", non-commercial" if card.non_commercial else ""
+    print(f"licence        {card.license}{limits}")
     return 0

@@ -25,7 +25,7 @@ from eqrt.core.tile import TileInfo, encode
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 from eqrt.runtime.decoding.generic_objects import MAX_OBJECT_ID, encode_cycle
 from eqrt.runtime.prediction.tiles import save_tile
-from eqrt.training.commonroad import Scenario, Track, lane_map, read_scenario
+from eqrt.training.recordings.commonroad import Scenario, Track, lane_map, read_scenario
 
 APART_M = 3000.0
 """Between the scenarios of one drive: no lane or car of one is near another."""

@@ -23,8 +23,8 @@ from eqrt.core.errors import TileError, UsageError
 from eqrt.core.lanes import Lane, LaneMap, LaneType, build_lane_map, middle_line
 from eqrt.core.tile import TileInfo, decode, encode
 from eqrt.export.osm import keep_lanelets, read_osm, tag_value
-from eqrt.training.commonroad import lane_map as commonroad_lane_map
-from eqrt.training.commonroad import read_scenario
+from eqrt.training.recordings.commonroad import lane_map as commonroad_lane_map
+from eqrt.training.recordings.commonroad import read_scenario
 
 Origin = tuple[float, float]
 """Latitude and longitude in degrees, WGS 84."""

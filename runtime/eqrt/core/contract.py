@@ -19,6 +19,10 @@ SCHEMA = 1
 METADATA_KEY = "eqrt_contract"
 """The ONNX metadata entry that holds the contract."""
 
+LANE_CHOICES = ("routes", "nearest")
+"""`routes`: the ways through the lane graph that the target may go, then other lanes. `nearest`:
+single lanes, the nearest first, as the papers have it. See the core modules of these names."""
+
 UNITS = {"position": "m", "time": "s", "frame": "tile: x east, y north"}
 
 
@@ -44,6 +48,8 @@ class ModelContract:
     """K, most probable first."""
     dt_s: float
     """Time between steps; the same for history and horizon."""
+    lane_choice: str = "routes"
+    """How the centerlines are chosen: one of LANE_CHOICES."""
 
     def __post_init__(self) -> None:
         for name in _SIZES:
@@ -54,6 +60,11 @@ class ModelContract:
                 )
         if not 0.0 < self.dt_s <= 1.0:
             raise ContractError(f"model contract: dt_s is {self.dt_s}, expected above 0 to 1 s")
+        if self.lane_choice not in LANE_CHOICES:
+            raise ContractError(
+                f"model contract: lane_choice is {self.lane_choice!r}, expected one of "
+                f"{', '.join(LANE_CHOICES)}; re-export the model with this version of eqrt"
+            )
 
     @property
     def inputs(self) -> dict[str, tuple[str, tuple[int | str, ...]]]:
@@ -105,6 +116,7 @@ class ModelContract:
                 f"{where}: model contract schema {values.get('schema')} is not supported (this "
                 f"runtime speaks {SCHEMA}); re-export the model with this version of eqrt"
             )
+        values = {"lane_choice": "routes", **values}  # what artifacts before it meant
         arguments: dict[str, Any] = {f.name: _typed(values, f.name, where) for f in fields(cls)}
         return cls(**arguments)
 

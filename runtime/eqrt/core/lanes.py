@@ -128,6 +128,13 @@ def middle_line(left: Float64, right: Float64) -> Float64:
     return (_at_fraction(left, fraction) + _at_fraction(right, fraction)) / 2.0
 
 
+def evenly_spaced(line: Float64) -> Float64:
+    """(n, 2) the polyline (m, 2) with a point about every `SPACING_M`, its ends kept."""
+    along = arclength(line)
+    fraction = np.linspace(0.0, 1.0, max(2, round(along[-1] / SPACING_M) + 1))
+    return np.stack([np.interp(fraction * along[-1], along, axis) for axis in line.T], axis=-1)
+
+
 def arclength(line: Float64) -> Float64:
     """(n,) metres along a polyline (n, 2) from its first point."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
+from eqrt.core.nearest import centerline_source
 from eqrt.core.scene import AgentHistories, Scene, build_scene, concatenate, tile_origin
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
@@ -96,6 +97,7 @@ class Pipeline:
         self._profile = profile
         self._predictor = predictor
         self._tile = tile
+        self._lanes = centerline_source(tile.lane_map, predictor.contract) if tile else None
         self._clock = clock
         self._nobody = _nobody(predictor.contract)
         self._controlled_s = -np.inf
@@ -190,8 +192,8 @@ class Pipeline:
     def _scene(
         self, agents: AgentHistories, targets: NDArray[np.intp], ego: EgoState, origin: Float64
     ) -> Scene:
-        routes = self._tile.routes if self._tile and ego.has_map_pose else None
-        return build_scene(agents, targets, self._predictor.contract, routes, origin)
+        lanes = self._lanes if ego.has_map_pose else None
+        return build_scene(agents, targets, self._predictor.contract, lanes, origin)
 
     def _agents(self, tracks: Tracks, anchor_s: float) -> AgentHistories:
         """All tracks, and the ego vehicle after them, on the clock that ends at `anchor_s`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -127,9 +128,12 @@ def load_pipeline(
     clock: Callable[[], float] | None,
 ) -> Pipeline:
     """The pipeline that `add_pipeline_arguments` describes; the others are as for Pipeline."""
+    predictor = Predictor.load(args.model)
+    if predictor.licence_notice:
+        print(f"eqrt: {predictor.licence_notice}", file=sys.stderr)
     return Pipeline(
         profile,
-        Predictor.load(args.model),
+        predictor,
         load_tile(args.tile) if args.tile else None,
         channels=channels,
         stationary=args.stationary,

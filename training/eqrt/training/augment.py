@@ -22,6 +22,8 @@ GHOST_M = 1.5
 class AugmentConfig:
     """Probabilities per window unless said otherwise."""
 
+    mirrored: float
+    """The whole scene, as if seen in a mirror: traffic that keeps to the other side."""
     scaled: float
     """The whole scene, lanes and future too, is made larger or smaller: other speeds."""
     max_scale: float
@@ -44,6 +46,8 @@ class AugmentConfig:
     """Per neighbour."""
     missing_line: float
     """Per centerline."""
+    line_offset_m: float
+    """Standard deviation, of where each centerline lies: maps are not exact."""
     no_map: float
     """Every centerline at once."""
     unknown_heading: float
@@ -66,6 +70,7 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
     batch = _stood(batch, still | chance(config.standing, windows, 1))
     batch = _ghosts(batch, chance(config.ghost, windows, agents), generator)
     batch = _scaled(batch, _scales(windows, config, generator))
+    batch = _mirrored(batch, chance(config.mirrored, windows))
     steps = batch["history_valid"].shape[2]
     lines = batch["centerlines_valid"].shape[1]
     first = torch.randint(0, steps - 1, (windows, 1, 1), generator=generator)
@@ -81,6 +86,7 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
         "history": batch["history"] + _noise(batch["history"], config, generator),
         "history_valid": batch["history_valid"] & ~drop,
         "heading": _heading(batch["heading"], config, generator),
+        "centerlines": _offset_lines(batch["centerlines"], config, generator),
         "centerlines_valid": batch["centerlines_valid"] & ~lost,
     }
 
@@ -127,9 +133,32 @@ def _scaled(batch: Batch, scale: Tensor) -> Batch:
     return batch | {name: grown(batch[name]) for name in ("history", "centerlines", "future")}
 
 
+def _mirrored(batch: Batch, chosen: Tensor) -> Batch:
+    """The windows chosen (B,), mirrored at the line through the target along x."""
+    here = batch["history"][:, 0, -1, 1]  # (B,)
+    sign = torch.where(chosen, -1.0, 1.0)
+
+    def flipped(points: Tensor) -> Tensor:
+        shape = (-1, *[1] * (points.dim() - 2))
+        center = here.view(shape)
+        y = center + (points[..., 1] - center) * sign.view(shape)
+        return torch.stack([points[..., 0], y], -1)
+
+    heading = batch["heading"] * torch.stack([torch.ones_like(sign), sign], -1)
+    turned = {name: flipped(batch[name]) for name in ("history", "centerlines", "future")}
+    return batch | turned | {"heading": heading}
+
+
 def _noise(history: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:
     level = torch.rand((len(history), 1, 1, 1), generator=generator) ** 2  # mostly clean
     return config.position_noise_m * level * torch.randn(history.shape, generator=generator)
+
+
+def _offset_lines(lines: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:
+    """Every line (B, Q, L, 2) shifted as a whole."""
+    return lines + config.line_offset_m * torch.randn(
+        (*lines.shape[:2], 1, 2), generator=generator
+    )
 
 
 def _heading(heading: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:

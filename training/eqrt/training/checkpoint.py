@@ -1,20 +1,19 @@
-"""Checkpoints: one safetensors file, the configuration and the data's credits in its header."""
+"""Checkpoints: one safetensors file with a network, its configuration, and where it comes from."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import safetensors
 import safetensors.torch
-import torch
+from torch import Tensor, nn
 
 from eqrt.core.errors import EqrtError
-from eqrt.training.config import ModelConfig
-from eqrt.training.model import EquivariantPredictor
+from eqrt.training.networks.registry import ModelConfig, build_network
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,57 +22,88 @@ class Card:
 
     name: str
     data: str
-    """Training data, credits and licence, one sentence."""
+    """Training data and its credits, one sentence per source."""
     license: str
-    """Licence of the weights (an SPDX expression)."""
+    """Licence of the weights (an SPDX expression, or the terms' name)."""
+    non_commercial: bool
+    """Whether some of the data forbids commercial use; `eqrt` then says so."""
     metrics: dict[str, float]
-    """Measured on the held-out data, metres."""
+    """Measured on the held-out data: metres, and shares in 0 to 1."""
     baseline: dict[str, float]
     """Of constant velocity on the same data."""
+    command: str
+    """What trained it, as typed."""
+    config_sha256: str
+    """Of the training configuration (`TrainConfig.sha256`)."""
+    parameters: int
+    steps: int
+    """Optimizer steps behind these weights."""
+    seed: int
 
 
-def save_checkpoint(path: Path, model: EquivariantPredictor, card: Card) -> None:
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """What `load_checkpoint` reads."""
+
+    network: nn.Module
+    config: ModelConfig
+    card: Card
+
+
+def save_checkpoint(path: Path, network: nn.Module, config: ModelConfig, card: Card) -> None:
     """Write the file at once: a reader sees the old one or the new one, never half."""
+    header = {"config": json.dumps(config.to_tables()), "card": json.dumps(asdict(card))}
+    write_tensors(path, network.state_dict(), header)
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """The network in evaluation mode, float32 on the CPU.
+
+    Raises EqrtError if the file is missing, damaged, or of another version of the network; it names
+    the fields that differ.
+    """
+    tensors, header = read_tensors(path)
+    try:
+        tables = json.loads(header["config"])
+        config = ModelConfig.from_tables(tables["scene"], tables["network"])
+        card = _read_card(header["card"])
+        network = build_network(config)
+    except (KeyError, ValueError, TypeError) as error:
+        raise EqrtError(f"{path}: not a checkpoint of this version ({error})") from error
+    load_tensors(path, network, tensors)
+    return Checkpoint(network.eval(), config, card)
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
+    """Write a safetensors file and then put it in its place."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"config": json.dumps(asdict(model.config)), "card": json.dumps(asdict(card))}
-    tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
     partial = path.with_suffix(path.suffix + ".part")
-    safetensors.torch.save_file(tensors, partial, metadata=header)
+    ready = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    with partial.open("wb") as file:
+        file.write(safetensors.torch.save(ready, metadata=header))
+        file.flush()
+        os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
     os.replace(partial, path)
 
 
-def load_checkpoint(path: Path) -> tuple[EquivariantPredictor, Card]:
-    """The network in evaluation mode, float32 on the CPU.
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors of a safetensors file, on the CPU, and its header.
 
-    Raises EqrtError if the file is missing, damaged, or of another version of the network.
+    Raises EqrtError if it is missing or damaged.
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no iterator)
-        model = EquivariantPredictor(_read(ModelConfig, header["config"]))
-        card = _read(Card, header["card"])
+            names = file.keys()
+            return {name: file.get_tensor(name) for name in names}, file.metadata() or {}
     except FileNotFoundError as error:
         raise EqrtError(f"{path}: no such checkpoint; `eqrt train` writes one") from error
-    except (OSError, safetensors.SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise EqrtError(f"{path}: not a checkpoint of this version ({error})") from error
-    _check_tensors(path, model, tensors)
-    model.load_state_dict(tensors)
-    return model.eval(), card
+    except (OSError, safetensors.SafetensorError) as error:
+        raise EqrtError(f"{path}: not a checkpoint ({error})") from error
 
 
-def _read(kind: type[Any], text: str) -> Any:
-    values = json.loads(text)
-    names = {field.name for field in fields(kind)}
-    if set(values) != names:
-        raise ValueError(f"{kind.__name__} fields differ: {sorted(set(values) ^ names)}")
-    return kind(**values)
-
-
-def _check_tensors(
-    path: Path, model: EquivariantPredictor, tensors: dict[str, torch.Tensor]
-) -> None:
-    expected = {name: tuple(value.shape) for name, value in model.state_dict().items()}
+def load_tensors(path: Path, network: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Fill `network` with `tensors`; EqrtError says which of them do not fit."""
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
     wrong = sorted(name for name in expected | found if expected.get(name) != found.get(name))
     if wrong:
@@ -81,3 +111,12 @@ def _check_tensors(
             f"{path}: {len(wrong)} tensors do not fit this network (first: {wrong[0]}, "
             f"found {found.get(wrong[0])}, expected {expected.get(wrong[0])}); train again"
         )
+    network.load_state_dict(tensors)
+
+
+def _read_card(text: str) -> Card:
+    values = json.loads(text)
+    names = {field.name for field in fields(Card)}
+    if set(values) != names:
+        raise ValueError(f"the card's fields differ: {', '.join(sorted(set(values) ^ names))}")
+    return Card(**values)

@@ -5,31 +5,61 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from eqrt.core.errors import EqrtError
 from eqrt.core.kinematics import constant_velocity
-from eqrt.core.metrics import displacement, error_table
-from eqrt.training.data import Windows
-from eqrt.training.model import EquivariantPredictor
+from eqrt.core.metrics import displacement, error_table, min_ade, min_fde, miss_rate
+from eqrt.training.dataset.windows import Windows
 
 INPUTS = ("history", "history_valid", "heading", "centerlines", "centerlines_valid")
+"""The contract's, in the order in which a network takes them."""
 _BATCH = 256
 
 
-def evaluate(model: EquivariantPredictor, windows: Windows) -> dict[str, float]:
-    """ADE/FDE at 1, 2, 3 s of the most probable mode, over complete windows, metres."""
+def evaluate(network: nn.Module, windows: Windows, dt_s: float) -> dict[str, float]:
+    """Errors over complete windows.
+
+    ADE/FDE at 1, 2, 3 s of the most probable mode, and if there are more also the best mode's
+    `min_ade`, `min_fde` (metres) and `miss_rate` (0 to 1), at the horizon.
+    """
     complete = _complete(windows)
-    best = predict(model, complete)[:, 0].astype(np.float64)
-    return error_table(displacement(best, complete.future.astype(np.float64)), model.config.dt_s)
+    trajectories = predict(network, complete).astype(np.float64)
+    return _errors(trajectories, complete, trajectories.shape[1], dt_s)
 
 
-def evaluate_constant_velocity(windows: Windows, dt_s: float) -> dict[str, float]:
-    """The same table for constant velocity."""
+def evaluate_constant_velocity(windows: Windows, num_modes: int, dt_s: float) -> dict[str, float]:
+    """The same table for constant velocity, whose one mode is then also the best of `num_modes`."""
     complete = _complete(windows)
-    future = complete.future.astype(np.float64)
     history = complete.history[:, 0].astype(np.float64)
-    course = constant_velocity(history, complete.history_valid[:, 0], future.shape[1])
-    return error_table(displacement(course, future), dt_s)
+    horizon = complete.future.shape[1]
+    course = constant_velocity(history, complete.history_valid[:, 0], horizon)
+    return _errors(course[:, None], complete, num_modes, dt_s)
+
+
+def predict(network: nn.Module, windows: Windows) -> NDArray[np.float32]:
+    """Trajectories (W, K, H, 2), tile frame; the network is in evaluation mode afterwards."""
+    device = next(network.parameters()).device
+    tensors = windows.tensors()
+    parts = []
+    network.eval()
+    with torch.no_grad():
+        for start in range(0, len(windows), _BATCH):
+            inputs = [tensors[name][start : start + _BATCH].to(device) for name in INPUTS]
+            parts.append(network(*inputs)[0].cpu().numpy())
+    return np.concatenate(parts)
+
+
+def _errors(
+    trajectories: NDArray[np.float64], windows: Windows, num_modes: int, dt_s: float
+) -> dict[str, float]:
+    distance = displacement(trajectories, windows.future[:, None].astype(np.float64))  # (W, K, H)
+    table = error_table(distance[:, 0], dt_s)
+    if num_modes > 1:
+        table["min_ade"] = float(min_ade(distance).mean())
+        table["min_fde"] = float(min_fde(distance).mean())
+        table["miss_rate"] = miss_rate(distance)
+    return table
 
 
 def _complete(windows: Windows) -> Windows:
@@ -40,15 +70,3 @@ def _complete(windows: Windows) -> Windows:
             " that are longer than both together"
         )
     return complete
-
-
-def predict(model: EquivariantPredictor, windows: Windows) -> NDArray[np.float32]:
-    """Trajectories (W, K, H, 2), tile frame."""
-    tensors = windows.tensors()
-    parts = []
-    model.eval()
-    with torch.no_grad():
-        for start in range(0, len(windows), _BATCH):
-            inputs = [tensors[name][start : start + _BATCH] for name in INPUTS]
-            parts.append(model(*inputs)[0].numpy())
-    return np.concatenate(parts)

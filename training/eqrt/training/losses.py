@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import torch
 from torch import Tensor
 
@@ -26,3 +28,51 @@ def best_mode_loss(
     best, index = distance.min(-1)
     chosen = probabilities.gather(1, index[:, None]).clamp(min=_TINY)
     return best.mean() - 0.5 * chosen.log().mean()
+
+
+def soft_mode_loss(
+    trajectories: Tensor, probabilities: Tensor, future: Tensor, valid: Tensor
+) -> Tensor:
+    """The best mode is pulled to the truth, its end most; every mode learns how likely it is.
+
+    Best is the mode with the least ADE plus half its final error. The likelihood to learn is soft:
+    a mode that comes nearly as close as the best is nearly as right.
+    """
+    ade = mode_displacement(trajectories, future, valid)  # (B, K)
+    fde = _final_displacement(trajectories, future, valid)
+    best = (ade + 0.5 * fde).argmin(-1, keepdim=True)
+    soft = (-(ade + fde).detach() / SOFTNESS_M).softmax(-1)
+    likelihood = (soft * probabilities.clamp(min=_TINY).log()).sum(-1)
+    pull = ade.gather(1, best) + FINAL_SHARE * fde.gather(1, best)
+    return pull.mean() - LIKELIHOOD_SHARE * likelihood.mean()
+
+
+SOFTNESS_M = 1.0
+"""Modes whose errors differ by less are about as likely."""
+FINAL_SHARE = 0.3
+LIKELIHOOD_SHARE = 0.7
+
+
+def _final_displacement(trajectories: Tensor, future: Tensor, valid: Tensor) -> Tensor:
+    """Distance (B, K) at the last seen step of the future."""
+    steps = torch.arange(1, valid.shape[-1] + 1, device=valid.device)
+    last = (valid * steps).argmax(-1)[:, None, None, None]  # (B, 1, 1, 1)
+    end = trajectories.gather(2, last.expand(-1, trajectories.shape[1], 1, 2)).squeeze(2)
+    offset = end - future.gather(1, last[:, 0].expand(-1, 1, 2))
+    return (offset.square().sum(-1) + _TINY).sqrt()
+
+
+def ade_loss(trajectories: Tensor, probabilities: Tensor, future: Tensor, valid: Tensor) -> Tensor:  # noqa: ARG001 (every loss is called alike)
+    """ADE of the most probable mode: the paper's loss. Other modes learn nothing from it."""
+    return mode_displacement(trajectories[:, :1], future, valid).mean()
+
+
+Loss = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""Of trajectories (B, K, H, 2), probabilities (B, K), future (B, H, 2), valid (B, H): the mean."""
+
+LOSSES: Mapping[str, Loss] = {
+    "ade": ade_loss,
+    "best_mode": best_mode_loss,
+    "soft_mode": soft_mode_loss,
+}
+"""What a configuration may name."""

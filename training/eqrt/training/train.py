@@ -1,71 +1,44 @@
-"""`eqrt train`: train a predictor on recorded scenarios.
+"""`eqrt train`: train a predictor on recorded or simulated traffic.
 
-A plain loop: seed, data, model, then steps. The weights kept are a running average of the weights
-trained (which evaluates better than any single step of it).
+    data --> Loader (threads: gather, augment) --> step --> running average --> evaluate, write
+                                                    ^                             |
+                                                    +--------- --resume ----------+
+
+The weights kept are a running average of the weights trained (which evaluates better than any
+single step of it). Everything random is seeded by (seed, step): a training that was stopped, killed
+or spread over several processes goes the way that it would have gone undisturbed.
 """
 
 from __future__ import annotations
 
 import argparse
-import copy
-import json
 import math
-import time
-import tomllib
-from dataclasses import dataclass, fields
+import shlex
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch.optim import AdamW
+from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from eqrt.core.errors import EqrtError, UsageError
-from eqrt.training.augment import AugmentConfig, augment
-from eqrt.training.checkpoint import Card, save_checkpoint
-from eqrt.training.config import ModelConfig
-from eqrt.training.data import Windows, batches, load_windows, scenario_files, scenario_name
-from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity
-from eqrt.training.losses import best_mode_loss
-from eqrt.training.model import EquivariantPredictor
+from eqrt.training.augment import Batch
+from eqrt.training.configuration import LoopConfig, TrainConfig, load_config
+from eqrt.training.dataset.store import licence_notice
+from eqrt.training.evaluate import INPUTS
+from eqrt.training.loader import BatchMaker, Loader
+from eqrt.training.losses import LOSSES
+from eqrt.training.progress import Display, Lines, Silence, new_display
+from eqrt.training.ranks import Ranks, alone, join_ranks
+from eqrt.training.recorder import MODEL_FILE, STATE_FILE, Goal, Recorder
+from eqrt.training.sampling import DROPOUT, Sampler, derived_seed
+from eqrt.training.state import TrainingState, load_state, new_state, update_average
+from eqrt.training.stopping import StopRequest
+from eqrt.training.training_data import TrainingData, open_training_data
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DataConfig:
-    """Which scenarios, and which of them are held out."""
-
-    held_out: list[str]
-    """Scenario names (without .xml) that are evaluated on and never trained on."""
-    stride: int
-    """Steps between training windows."""
-    credits: str
-    license: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopConfig:
-    """How the network is trained."""
-
-    steps: int
-    batch_size: int
-    learning_rate: float
-    weight_decay: float
-    warmup_steps: int
-    max_grad_norm: float
-    average_decay: float
-    """Of the running average of the weights, per step."""
-    evaluate_every: int
-    seed: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainConfig:
-    """A configuration file: [model], [data], [train], [augment]."""
-
-    name: str
-    model: ModelConfig
-    data: DataConfig
-    train: LoopConfig
-    augment: AugmentConfig
+REPORT_EVERY = 50
+"""Steps between two looks at the loss."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,131 +46,195 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config", type=Path, required=True, help="TOML file, see training/configs"
     )
-    parser.add_argument("--data", type=Path, required=True, help="folder of CommonRoad scenarios")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        required=True,
+        action="append",
+        help="folder of `eqrt prepare`, or a dataset as it is; may be given several times",
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoint and metrics")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the state in --out, if there is one"
+    )
     parser.add_argument("--steps", type=int, help="instead of the configuration's")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default 1)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads to compute (default 1)")
+    parser.add_argument(
+        "--loader-threads", type=int, default=1, help="threads that make batches (default 1)"
+    )
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default cpu)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, evaluate, save."""
+    """Train, evaluate, save; 128 + its number after a signal."""
+    config = _config(args)
     torch.set_num_threads(args.threads)
-    config = load_config(args.config)
-    steps = args.steps or config.train.steps
-    training, held_out = load_data(config, args.data)
-    course = evaluate_constant_velocity(held_out, config.model.dt_s)
-    print(f"constant velocity   {_row(course)}", flush=True)
-    model = train(config, training, held_out, steps, args.out)
-    metrics = evaluate(model, held_out)
-    print(f"held out            {_row(metrics)}")
-    card = Card(
-        name=config.name,
-        data=config.data.credits,
-        license=config.data.license,
-        metrics=metrics,
-        baseline=course,
-    )
-    save_checkpoint(args.out / "model.safetensors", model, card)
-    print(f"checkpoint          {args.out / 'model.safetensors'}")
+    if (args.out / STATE_FILE).exists() and not args.resume:
+        raise UsageError(
+            f"{args.out}: holds a training already; go on with --resume, or choose another --out"
+        )
+    with join_ranks(args.device) as ranks:
+        data = open_training_data(config, args.data)
+        steps = config.train.total_steps(data.pool.samples_per_epoch)
+        shown = new_display(steps) if ranks.leads else Silence()
+        with shown as display, StopRequest() as stop:
+            _introduce(config, data, ranks, display)
+            state = train(
+                config,
+                data,
+                args.out,
+                ranks=ranks,
+                resume=args.resume,
+                loader_threads=args.loader_threads,
+                display=display,
+                should_stop=stop,
+                command=_command(args),
+            )
+            if state.step < steps:
+                display.line(f"stopped after step {state.step} of {steps}; to go on:")
+                display.line(f"  {_command(args, resume=True)}")
+                return stop.exit_status
+            display.line(f"checkpoint          {args.out / MODEL_FILE}")
     return 0
 
 
-def load_config(path: Path) -> TrainConfig:
-    """Read a configuration; EqrtError names the first field that is missing or unknown."""
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise UsageError(f"{path}: no such configuration; see training/configs") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise EqrtError(f"{path}: not TOML ({error})") from error
-    tables = {"model": ModelConfig, "data": DataConfig, "train": LoopConfig}
-    tables |= {"augment": AugmentConfig}
-    parsed = {name: _table(kind, values.pop(name, {}), path, name) for name, kind in tables.items()}
-    config: TrainConfig = _table(TrainConfig, values | parsed, path, "top level")
-    return config
-
-
-def load_data(config: TrainConfig, folder: Path) -> tuple[Windows, Windows]:
-    """Training and held-out windows, split by recording."""
-    files = {scenario_name(path): path for path in scenario_files(folder)}
-    missing = sorted(set(config.data.held_out) - set(files))
-    if missing:
-        raise EqrtError(f"{folder}: held-out scenario {missing[0]} is not here")
-    contract = config.model.contract(config.name, "0.0.0")
-    train_files = [path for name, path in files.items() if name not in config.data.held_out]
-    if not train_files:
-        raise EqrtError(f"{folder}: every scenario here is held out; nothing to train on")
-    held_files = [files[name] for name in config.data.held_out]
-    training = load_windows(train_files, contract, config.data.stride)
-    held_out = load_windows(held_files, contract, config.data.stride)
-    print(f"training windows    {len(training)} of {len(train_files)} scenarios")
-    print(f"held-out windows    {len(held_out)} of {len(held_files)} scenarios", flush=True)
-    return training, held_out
-
-
 def train(
-    config: TrainConfig, training: Windows, held_out: Windows, steps: int, out: Path
-) -> EquivariantPredictor:
-    """The loop. Returns the averaged network; `out` receives `metrics.jsonl`."""
+    config: TrainConfig,
+    data: TrainingData,
+    out: Path,
+    *,
+    ranks: Ranks | None = None,
+    resume: bool = False,
+    loader_threads: int = 1,
+    display: Display | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    command: str = "",
+) -> TrainingState:
+    """The loop. `out` receives the checkpoint, the state, the metrics and their plots.
+
+    The state returned has done all its steps, or fewer if `should_stop` said so. With `resume`, the
+    training goes on from the state in `out` if there is one. Raises EqrtError if that state is of
+    another training, or if the loss is no longer a number.
+    """
+    loop, ranks, display = config.train, ranks or alone(), display or Lines()
+    make = batch_maker(config, data, ranks)
+    steps = loop.total_steps(data.pool.samples_per_epoch)
+    state = new_state(config, ranks.device)
+    if resume and (out / STATE_FILE).exists():
+        load_state(out / STATE_FILE, state, config, data.pool.fingerprint())
+        display.line(f"resumed             after step {state.step} of {steps}")
+    goal = Goal(config, data, out, command)
+    model = ranks.parallel(state.network)
+    with (
+        closing(Recorder(goal, state, ranks=ranks, display=display)) as recorder,
+        Loader(make, state.step, steps, loader_threads, ranks.device) as loader,
+    ):
+        for batch in loader:
+            set_learning_rate(state.optimizer, learning_rate(loop, state.step, steps))
+            torch.manual_seed(derived_seed(DROPOUT, loop.seed, state.step, ranks.rank))
+            recorder.add(*train_step(model, state.optimizer, batch, loop))
+            update_average(state.average, state.network, loop.average_decay)
+            state.step += 1
+            stopping = ranks.any(should_stop())
+            if state.step % loop.evaluate_every == 0 or state.step == steps:
+                recorder.evaluate()
+            elif state.step % REPORT_EVERY == 0:
+                recorder.report()
+            if stopping:
+                recorder.save_state()
+                break
+        recorder.plot()
+        recorder.summarize(loader.times, loader_threads)
+    return state
+
+
+def train_step(
+    model: nn.Module, optimizer: Optimizer, batch: Batch, config: LoopConfig
+) -> tuple[Tensor, Tensor]:
+    """One step of the optimizer. Returns the loss, and the gradient's length before clipping."""
+    model.train()
+    in_bf16 = config.precision == "bf16"
+    with torch.autocast(batch["future"].device.type, torch.bfloat16, enabled=in_bf16):
+        trajectories, probabilities = model(*(batch[name] for name in INPUTS))
+    # In float32: bf16 knows 50 m only in steps of 0.25 m, and the loss is about centimetres.
+    loss = LOSSES[config.loss](
+        trajectories.float(), probabilities.float(), batch["future"], batch["future_valid"]
+    )
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.max_grad_norm)
+    optimizer.step()
+    return loss, grad_norm
+
+
+def learning_rate(config: LoopConfig, step: int, steps: int) -> float:
+    """Linear warm-up, then half a cosine down to zero, or no change."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    if config.schedule == "constant":
+        return config.learning_rate
+    done = (step - config.warmup_steps) / max(steps - config.warmup_steps, 1)
+    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+def set_learning_rate(optimizer: Optimizer, rate: float) -> None:
+    """For every group of weights."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
+def batch_maker(config: TrainConfig, data: TrainingData, ranks: Ranks) -> BatchMaker:
+    """What makes this rank's part of each step's batch.
+
+    Raises EqrtError if the batch cannot be shared equally: the mean of unequal parts' means is not
+    the mean of the whole.
+    """
     loop = config.train
-    torch.manual_seed(loop.seed)
-    generator = torch.Generator().manual_seed(loop.seed)
-    model = EquivariantPredictor(config.model)
-    average = copy.deepcopy(model)
-    optimizer = AdamW(model.parameters(), loop.learning_rate, weight_decay=loop.weight_decay)
-    stream = batches(training, loop.batch_size, generator)
-    out.mkdir(parents=True, exist_ok=True)
-    started, running = time.perf_counter(), 0.0
-    with (out / "metrics.jsonl").open("w", encoding="utf-8") as log:
-        for step in range(steps):
-            for group in optimizer.param_groups:
-                group["lr"] = loop.learning_rate * schedule(step, steps, loop.warmup_steps)
-            batch = augment(next(stream), config.augment, generator)
-            model.train()
-            trajectories, probabilities = model(*(batch[name] for name in INPUTS))
-            loss = best_mode_loss(
-                trajectories, probabilities, batch["future"], batch["future_valid"]
-            )
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-            torch.nn.utils.clip_grad_norm_(model.parameters(), loop.max_grad_norm)
-            optimizer.step()
-            update_average(average, model, loop.average_decay)
-            running = loss.item() if step == 0 else 0.98 * running + 0.02 * loss.item()
-            if (step + 1) % loop.evaluate_every == 0 or step + 1 == steps:
-                metrics = evaluate(average, held_out)
-                seconds = time.perf_counter() - started
-                print(
-                    f"step {step + 1:>6} loss {running:.3f} {_row(metrics)} {seconds:.0f} s",
-                    flush=True,
-                )
-                log.write(json.dumps({"step": step + 1, "loss": running, **metrics}) + "\n")
-                log.flush()
-    return average.eval()
+    if loop.batch_size % ranks.world:
+        raise EqrtError(
+            f"batch_size {loop.batch_size} cannot be shared equally by {ranks.world} processes; "
+            "make it a multiple"
+        )
+    return BatchMaker(
+        pool=data.pool,
+        sampler=Sampler(data.pool, loop.batch_size, loop.seed),
+        augmentation=config.augment,
+        batch_size=loop.batch_size,
+        seed=loop.seed,
+        rank=ranks.rank,
+        world=ranks.world,
+    )
 
 
-def update_average(average: torch.nn.Module, model: torch.nn.Module, decay: float) -> None:
-    """Move the averaged weights a little towards the trained ones, in place."""
-    with torch.no_grad():
-        for mean, weight in zip(average.parameters(), model.parameters(), strict=True):
-            mean.lerp_(weight, 1.0 - decay)
+def _config(args: argparse.Namespace) -> TrainConfig:
+    config = load_config(args.config)
+    for option in ("steps", "threads", "loader_threads"):
+        value = getattr(args, option)
+        if value is not None and value < 1:
+            raise UsageError(f"--{option.replace('_', '-')} is {value}, expected 1 or more")
+    return config.with_steps(args.steps) if args.steps else config
 
 
-def schedule(step: int, steps: int, warmup_steps: int) -> float:
-    """Linear warm-up, then half a cosine down to zero: a factor on the learning rate."""
-    if step < warmup_steps:
-        return (step + 1) / warmup_steps
-    return 0.5 * (1.0 + math.cos(math.pi * (step - warmup_steps) / max(steps - warmup_steps, 1)))
+def _introduce(config: TrainConfig, data: TrainingData, ranks: Ranks, display: Display) -> None:
+    """What is trained, on what, and whether one may sell the result."""
+    display.line(f"training windows    {len(data.pool)}, {data.pool.samples_per_epoch} an epoch")
+    display.line(f"held-out targets    {len(data.held_out)}")
+    display.line(licence_notice(data.source) or f"data licence        {data.source.license}")
+    if ranks.world > 1:
+        share = config.train.batch_size // ranks.world
+        display.line(f"processes           {ranks.world}, {share} windows of every batch each")
 
 
-def _table(kind: type[Any], values: object, path: Path, where: str) -> Any:
-    names = {field.name for field in fields(kind)}
-    if not isinstance(values, dict) or set(values) != names:
-        found = set(values) if isinstance(values, dict) else set()
-        wrong = ", ".join(sorted(names ^ found))
-        raise EqrtError(f"{path}: [{where}] has missing or unknown fields: {wrong}")
-    return kind(**values)
-
-
-def _row(metrics: dict[str, float]) -> str:
-    return " ".join(f"{name} {value:.3f}" for name, value in metrics.items())
+def _command(args: argparse.Namespace, resume: bool = False) -> str:
+    """The command line again."""
+    words = ["eqrt", "train", "--config", args.config]
+    words += [word for path in args.data for word in ("--data", path)]
+    words += ["--out", args.out]
+    words += ["--steps", args.steps] if args.steps else []
+    for option in ("threads", "loader_threads"):
+        words += [f"--{option.replace('_', '-')}", getattr(args, option)]
+    words += ["--device", args.device]
+    words += ["--resume"] if resume else []
+    return shlex.join(map(str, words))

@@ -49,12 +49,22 @@ class Prediction:
 class Predictor:
     """An artifact, loaded and proven by its own test vector."""
 
-    def __init__(self, session: onnxruntime.InferenceSession, contract: ModelContract, sha256: str):
+    def __init__(
+        self,
+        session: onnxruntime.InferenceSession,
+        contract: ModelContract,
+        sha256: str,
+        metadata: Mapping[str, str],
+    ) -> None:
         self._session = session
         self.contract = contract
         self._outputs = list(contract.outputs)
         self.model_id = sha256[:8]
         """First digits of the model file's SHA-256: which model made a prediction."""
+        self.license = metadata.get("license", "")
+        """Of the weights; empty where the file does not say."""
+        self.non_commercial = metadata.get("non_commercial") == "true"
+        """Whether the data it was trained on forbids commercial use."""
 
     @classmethod
     def load(cls, folder: Path, threads: int = 1) -> Predictor:
@@ -65,7 +75,8 @@ class Predictor:
         """
         content = _read_checked(folder)
         session = _session(content, folder, threads)
-        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        metadata = session.get_modelmeta().custom_metadata_map
+        text = metadata.get(METADATA_KEY)
         if text is None:
             raise ContractError(
                 f"{folder / 'model.onnx'}: no {METADATA_KEY!r} metadata, so this is not an eqrt "
@@ -73,7 +84,7 @@ class Predictor:
             )
         contract = ModelContract.from_json(text, str(folder / "model.onnx"))
         _check_tensors(session, contract, folder)
-        predictor = cls(session, contract, hashlib.sha256(content).hexdigest())
+        predictor = cls(session, contract, hashlib.sha256(content).hexdigest(), metadata)
         predictor._self_check(folder)
         return predictor
 
@@ -88,6 +99,13 @@ class Predictor:
         ]
         trajectories, probabilities = (np.concatenate(parts) for parts in zip(*runs, strict=True))
         return Prediction(trajectories + scene.origin, probabilities)
+
+    @property
+    def licence_notice(self) -> str | None:
+        """The line to print when the weights may not be used commercially, else None."""
+        if not self.non_commercial:
+            return None
+        return f"model licence: {self.license}, non-commercial ({self.contract.name})"
 
     def _self_check(self, folder: Path) -> None:
         vectors = sorted(folder.glob("test_data_set_*"))

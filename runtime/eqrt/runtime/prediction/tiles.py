@@ -1,4 +1,4 @@
-"""Tile files: a lane map ready to be searched, from disk and to disk."""
+"""Tile files: a lane map, from disk and to disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 
 from eqrt.core.errors import TileError
 from eqrt.core.lanes import LaneMap
-from eqrt.core.routes import RouteFinder
 from eqrt.core.tile import MAX_FILE_BYTES, TileInfo, decode
 
 
@@ -18,7 +17,6 @@ class Tile:
     """One loaded tile."""
 
     lane_map: LaneMap
-    routes: RouteFinder
     info: TileInfo
 
 
@@ -35,7 +33,7 @@ def load_tile(path: Path) -> Tile:
     except OSError as error:
         raise TileError(f"{path}: the tile cannot be read ({error.strerror})") from error
     lane_map, info = decode(data, str(path))
-    return Tile(lane_map, RouteFinder(lane_map), info)
+    return Tile(lane_map, info)
 
 
 def save_tile(path: Path, data: bytes) -> None:

@@ -1,0 +1,1 @@
+"""How well a model predicts recorded traffic: errors (`eqrt eval`) and pictures (`eqrt plot`)."""

@@ -1,0 +1,163 @@
+"""What is evaluated: an artifact as the car runs it, a checkpoint, and physics beside them.
+
+Every one maps W windows to trajectories (W, K, H, 2) in the tile frame, metres, and probabilities
+(W, K), the most probable mode first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from eqrt.core.contract import ModelContract
+from eqrt.core.errors import EqrtError
+from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
+from eqrt.core.scene import Scene
+from eqrt.runtime.prediction.predictor import Predictor
+from eqrt.training.checkpoint import Checkpoint, load_checkpoint
+from eqrt.training.dataset.windows import Windows
+from eqrt.training.recordings.formats import forbids_commerce
+
+Float64 = NDArray[np.float64]
+
+CHECKPOINT_NAME = "model.safetensors"
+INPUTS = ("history", "history_valid", "heading", "centerlines", "centerlines_valid")
+
+
+class Forecast(Protocol):
+    """Predicts windows."""
+
+    def __call__(self, windows: Windows) -> tuple[Float64, Float64]:
+        """Trajectories (W, K, H, 2) tile frame, most probable first; probabilities (W, K)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelCard:
+    """Which model it is, for the report. Plain data: it crosses processes."""
+
+    path: str
+    kind: str
+    """`artifact` or `checkpoint`."""
+    name: str
+    version: str
+    """Of the artifact; a checkpoint has none."""
+    model_id: str
+    """First digits of the file's SHA-256."""
+    modes: int
+    """K."""
+    horizon_steps: int
+    dt_s: float
+    license: str
+    """Of the weights; empty where nothing says it."""
+    non_commercial: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A model that can be evaluated."""
+
+    card: ModelCard
+    contract: ModelContract
+    predict: Forecast
+
+
+def load_model(path: Path, threads: int = 1) -> Model:
+    """An artifact's folder, a checkpoint, or the folder of one.
+
+    Raises EqrtError if there is neither, and what the loaders of the two raise.
+    """
+    if (path / "model.onnx").is_file():
+        return _load_artifact(path, threads)
+    checkpoint = path / CHECKPOINT_NAME if path.is_dir() else path
+    if not checkpoint.is_file():
+        raise EqrtError(
+            f"{path}: no model here; give the folder of model.onnx (`eqrt export` writes it) or a "
+            f"{CHECKPOINT_NAME} (`eqrt train` does)"
+        )
+    torch.set_num_threads(threads)
+    return _from_checkpoint(checkpoint, load_checkpoint(checkpoint))
+
+
+def _load_artifact(folder: Path, threads: int) -> Model:
+    predictor = Predictor.load(folder, threads)
+    contract = predictor.contract
+
+    def predict(windows: Windows) -> tuple[Float64, Float64]:
+        inputs = {name: getattr(windows, name) for name in INPUTS}
+        found = predictor.predict(Scene(**inputs, origin=np.zeros(2)))  # stays in the tile frame
+        return found.trajectories, found.probabilities.astype(np.float64)
+
+    card = _card(
+        folder,
+        contract,
+        kind="artifact",
+        model_id=predictor.model_id,
+        license_=predictor.license,
+        nc=predictor.non_commercial or forbids_commerce(predictor.license),
+    )
+    return Model(card, contract, predict)
+
+
+def _from_checkpoint(path: Path, checkpoint: Checkpoint) -> Model:
+    card, network = checkpoint.card, checkpoint.network
+    contract = checkpoint.config.scene.contract(card.name, "0.0.0")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+
+    def predict(windows: Windows) -> tuple[Float64, Float64]:
+        tensors = windows.tensors()
+        with torch.no_grad():
+            trajectories, probabilities = network(*(tensors[name] for name in INPUTS))
+        return trajectories.numpy().astype(np.float64), probabilities.numpy().astype(np.float64)
+
+    told = _card(
+        path,
+        contract,
+        kind="checkpoint",
+        model_id=digest[:8],
+        license_=card.license,
+        nc=card.non_commercial or forbids_commerce(card.license),
+    )
+    return Model(told, contract, predict)
+
+
+def baselines(dt_s: float, horizon_steps: int) -> Mapping[str, Forecast]:
+    """Constant velocity, and constant turn rate and velocity, of the target's own history."""
+
+    def velocity(windows: Windows) -> tuple[Float64, Float64]:
+        history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
+        return _one_mode(constant_velocity(history, valid, horizon_steps))
+
+    def turn(windows: Windows) -> tuple[Float64, Float64]:
+        history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
+        motion = fit_motion(history, valid, dt_s)
+        return _one_mode(constant_turn(history[:, -1], *motion, horizon_steps, dt_s))
+
+    return {"constant velocity": velocity, "constant turn rate": turn}
+
+
+def _one_mode(course: Float64) -> tuple[Float64, Float64]:
+    return course[:, None], np.ones((len(course), 1))
+
+
+def _card(
+    path: Path, contract: ModelContract, *, kind: str, model_id: str, license_: str, nc: bool
+) -> ModelCard:
+    return ModelCard(
+        path=str(path),
+        kind=kind,
+        name=contract.name,
+        version=contract.version if kind == "artifact" else "",
+        model_id=model_id,
+        modes=contract.num_modes,
+        horizon_steps=contract.horizon_steps,
+        dt_s=contract.dt_s,
+        license=license_,
+        non_commercial=nc,
+    )

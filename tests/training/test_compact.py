@@ -1,0 +1,234 @@
+"""The network's promises, in float64, on untrained weights: they hold by construction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from eqrt.core.frames import Pose2
+from eqrt.core.scene import Scene
+from eqrt.export.vectors import (
+    move,
+    named_scenes,
+    nan_where_invalid,
+    road_scene,
+    seen_for,
+    without_map,
+    without_neighbours,
+)
+from eqrt.training.losses import best_mode_loss
+from eqrt.training.networks.canonical import canonical_from_tile
+from eqrt.training.networks.compact import CompactConfig, CompactPredictor
+from eqrt.training.networks.config import SceneConfig
+from poses import random_pose
+
+SCENE = SceneConfig(
+    num_agents=6,
+    history_steps=20,
+    num_centerlines=5,
+    centerline_points=12,
+    lane_choice="routes",
+    horizon_steps=30,
+    num_modes=3,
+    dt_s=0.1,
+)
+CONFIG = CompactConfig(width=24, heads=4, layers=1, decoder_layers=2, dropout=0.1)
+CONTRACT = SCENE.contract("test", "0.0.0")
+SCENES = named_scenes(CONTRACT)
+SOMEWHERE = Pose2(5.0, 5.0, 0.3)
+
+
+@pytest.fixture(scope="module")
+def model() -> CompactPredictor:
+    """Random weights everywhere, also where training starts from zero."""
+    torch.manual_seed(7)
+    model = CompactPredictor(SCENE, CONFIG).double().eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    return model
+
+
+def predict(model: CompactPredictor, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    inputs = [torch.from_numpy(value) for value in scene.inputs().values()]
+    with torch.no_grad():
+        trajectories, probabilities = model(
+            *(value.double() if value.is_floating_point() else value for value in inputs)
+        )
+    return trajectories.numpy(), probabilities.numpy()
+
+
+def in_double(scene: Scene) -> Scene:
+    """Turning in float64, so that nothing but the network can break the symmetry."""
+    names = ("history", "heading", "centerlines")
+    changes: dict[str, Any] = {name: getattr(scene, name).astype(np.float64) for name in names}
+    return replace(scene, **changes)
+
+
+def move_exactly(scene: Scene, pose: Pose2) -> Scene:
+    changes: dict[str, Any] = {
+        "history": pose.apply(np.asarray(scene.history, np.float64)),
+        "heading": pose.rotate(np.asarray(scene.heading, np.float64)),
+        "centerlines": pose.apply(np.asarray(scene.centerlines, np.float64)),
+    }
+    return replace(scene, **changes)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_turning_and_shifting_the_world_turns_and_shifts_the_prediction(
+    model: CompactPredictor, name: str
+) -> None:
+    rng = np.random.default_rng(3)
+    scene = in_double(nan_free(SCENES[name]))
+    before, probabilities = predict(model, scene)
+    for _ in range(10):
+        pose = random_pose(rng, 900.0)
+        after, same = predict(model, move_exactly(scene, pose))
+        np.testing.assert_allclose(after, pose.apply(before), atol=1e-8)
+        np.testing.assert_allclose(same, probabilities, atol=1e-10)
+
+
+def nan_free(scene: Scene) -> Scene:
+    return replace(
+        scene, history=np.nan_to_num(scene.history), centerlines=np.nan_to_num(scene.centerlines)
+    )
+
+
+def test_a_mirror_image_is_another_scene(model: CompactPredictor) -> None:
+    """Traffic keeps to one side: SE(2), deliberately not E(2)."""
+    scene = in_double(SCENES["driving"])
+    flip = np.array([1.0, -1.0])
+    mirrored = replace(scene, history=scene.history * flip, centerlines=scene.centerlines * flip)
+    before, _ = predict(model, scene)
+    after, _ = predict(model, mirrored)
+    assert np.abs(after * flip - before).max() > 0.01
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_values_under_false_masks_are_never_read(model: CompactPredictor, name: str) -> None:
+    clean, _ = predict(model, nan_free(SCENES[name]))
+    dirty, _ = predict(model, nan_where_invalid(SCENES[name]))
+    np.testing.assert_array_equal(dirty, clean)
+
+
+def test_an_agent_that_was_never_seen_moves_nobody(model: CompactPredictor) -> None:
+    scene = without_neighbours(SCENES["driving"])
+    elsewhere = replace(scene, history=scene.history.copy())
+    elsewhere.history[:, 1:] += 5.0
+    np.testing.assert_array_equal(predict(model, scene)[0], predict(model, elsewhere)[0])
+
+
+def test_padding_with_more_agents_and_lines_changes_nothing(model: CompactPredictor) -> None:
+    scene = SCENES["driving"]
+    agents, lines = SCENE.num_agents, SCENE.num_centerlines
+    small = replace(
+        scene,
+        history=scene.history[:, :3],
+        history_valid=scene.history_valid[:, :3],
+        centerlines=scene.centerlines[:, :2],
+        centerlines_valid=scene.centerlines_valid[:, :2],
+    )
+    padded = replace(
+        scene,
+        history_valid=scene.history_valid & (np.arange(agents) < 3)[None, :, None],
+        centerlines_valid=scene.centerlines_valid & (np.arange(lines) < 2)[None, :, None],
+    )
+    np.testing.assert_allclose(predict(model, padded)[0], predict(model, small)[0], atol=1e-10)
+
+
+def test_the_order_of_neighbours_and_lines_does_not_matter(model: CompactPredictor) -> None:
+    scene = SCENES["driving"]
+    agents, lines = [0, 4, 2, 5, 1, 3], [3, 0, 4, 1, 2]
+    shuffled = replace(
+        scene,
+        history=scene.history[:, agents],
+        history_valid=scene.history_valid[:, agents],
+        centerlines=scene.centerlines[:, lines],
+        centerlines_valid=scene.centerlines_valid[:, lines],
+    )
+    np.testing.assert_allclose(predict(model, shuffled)[0], predict(model, scene)[0], atol=1e-10)
+
+
+def test_neighbours_and_map_do_matter(model: CompactPredictor) -> None:
+    full, _ = predict(model, SCENES["driving"])
+    for poorer in (without_map(SCENES["driving"]), without_neighbours(SCENES["driving"])):
+        assert np.abs(predict(model, poorer)[0] - full).max() > 1e-4
+
+
+def test_a_lone_standing_agent_without_map_is_predicted_where_it_stands(
+    model: CompactPredictor,
+) -> None:
+    """Nothing in such a scene has a direction, so no other answer could be equivariant."""
+    scene = SCENES["lone_agent_no_map_stopped"]
+    trajectories, _ = predict(model, scene)
+    here = np.broadcast_to(scene.history[0, 0, -1], trajectories.shape)
+    np.testing.assert_allclose(trajectories, here, atol=1e-6)
+
+
+def test_probabilities_sum_to_one_and_fall(model: CompactPredictor) -> None:
+    for scene in SCENES.values():
+        _, probabilities = predict(model, scene)
+        np.testing.assert_allclose(probabilities.sum(-1), 1.0)
+        assert (np.diff(probabilities, axis=-1) <= 0).all()
+
+
+@pytest.mark.parametrize("steps", [1, 2, 20])
+def test_gradients_are_finite_whatever_is_masked(steps: int) -> None:
+    torch.manual_seed(1)
+    model = CompactPredictor(SCENE, CONFIG)
+    for scene in (SCENES["stopped"], without_map(SCENES["driving"]), SCENES["driving"]):
+        model.zero_grad()
+        inputs = [torch.from_numpy(value) for value in seen_for(scene, steps).inputs().values()]
+        future = torch.zeros(1, SCENE.horizon_steps, 2)
+        seen = torch.ones(1, SCENE.horizon_steps, dtype=torch.bool)
+        trajectories, probabilities = model(*inputs)
+        loss = best_mode_loss(trajectories, probabilities, future, seen)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+        gradients: list[Tensor] = [p.grad for p in model.parameters() if p.grad is not None]
+        assert gradients
+        assert all(torch.isfinite(gradient).all() for gradient in gradients)
+
+
+def test_the_rotation_turns_the_heading_onto_x() -> None:
+    heading = torch.tensor([[0.6, 0.8], [-1.0, 0.0]])
+    turned = heading.unsqueeze(1) @ canonical_from_tile(heading)
+    torch.testing.assert_close(turned[:, 0], torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
+
+
+def test_the_printed_sign_of_the_rotation_would_not_be_invariant(
+    model: CompactPredictor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The paper prints the rotation by +theta; only -theta makes the network equivariant."""
+
+    def printed(heading: Tensor) -> Tensor:
+        return canonical_from_tile(heading).transpose(-1, -2)
+
+    monkeypatch.setattr("eqrt.training.networks.compact.canonical_from_tile", printed)
+    scene, pose = in_double(SCENES["driving"]), Pose2(3.0, 4.0, 1.0)
+    before, _ = predict(model, scene)
+    after, _ = predict(model, move_exactly(scene, pose))
+    assert np.abs(after - pose.apply(before)).max() > 1e-3
+
+
+def test_a_slowly_stopping_target_is_predicted_without_a_jump(model: CompactPredictor) -> None:
+    """Between driving, crawling and standing the expected end moves, but nowhere jumps.
+
+    Where it moves most from one speed to the next, it moves in proportion to the difference.
+    """
+
+    def ends(speeds: np.ndarray) -> np.ndarray:
+        """Expectation over the modes, whose order changes where two are as probable."""
+        pairs = [predict(model, move(road_scene(CONTRACT, float(v)), SOMEWHERE)) for v in speeds]
+        return np.array([probabilities[0] @ paths[0, :, -1] for paths, probabilities in pairs])
+
+    speeds = np.linspace(2.0, 0.0, 101)
+    moved = np.linalg.norm(np.diff(ends(speeds), axis=0), axis=-1)
+    at = int(moved.argmax())
+    between = np.linspace(speeds[at], speeds[at + 1], 11)
+    finer = np.linalg.norm(np.diff(ends(between), axis=0), axis=-1)
+    assert finer.max() < 0.3 * moved[at]

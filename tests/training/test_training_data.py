@@ -1,0 +1,79 @@
+"""What is trained on, what is measured on, and how often each window is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eqrt.core.errors import EqrtError
+from eqrt.training.configuration import DataConfig
+from eqrt.training.dataset.windows import MIN_DRIVE_M
+from eqrt.training.training_data import TrainingData, open_training_data
+from tiny_training import DATA, tiny
+from window_samples import packed_scenes
+
+SCENES = 12
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve scenes of Argoverse's layout: a target and three cars each, one of them seen late."""
+    return packed_scenes(tmp_path_factory.mktemp("scenes") / "scenes.npz", SCENES)
+
+
+def opened(path: Path, data: DataConfig, *more: Path) -> TrainingData:
+    return open_training_data(replace(tiny(), data=data), [path, *more])
+
+
+def test_a_model_is_measured_on_the_datasets_own_targets(scenes: Path) -> None:
+    data = opened(scenes, DataConfig(held_out=("1", "2", "3")))
+    assert len(data.held_out) == 3
+    assert data.held_out.focal.all()
+    assert data.held_out.future_valid.all()
+
+
+def test_it_is_trained_on_everybody_else(scenes: Path) -> None:
+    data = opened(scenes, DataConfig(held_out=("1", "2", "3")))
+    windows = data.pool.gather(np.arange(len(data.pool)))
+    assert set(windows.recording) == set(range(3, SCENES))
+    assert 0 < windows.focal.sum() < len(windows)
+
+
+def test_weights_tell_targets_driving_and_standing_windows_apart(scenes: Path) -> None:
+    config = DataConfig(held_out=("1",), focal_weight=3.0, driving_weight=2.0, standing_weight=0.5)
+    pool = opened(scenes, config).pool
+    windows = pool.gather(np.arange(len(pool)))
+    first = windows.history_valid[:, 0].argmax(axis=1)
+    began = windows.history[np.arange(len(pool)), 0, first]
+    drives = np.hypot(*(windows.future[:, -1] - began).T) >= MIN_DRIVE_M  # all are seen to the end
+    assert set(pool.weights) == {3.0, 2.0, 0.5}
+    assert np.array_equal(pool.weights == 3.0, windows.focal)
+    assert np.array_equal(pool.weights == 2.0, drives & ~windows.focal)
+    assert pool.samples_per_epoch == round(pool.weights.sum())
+
+
+def test_several_datasets_are_trained_on_together_and_each_is_measured_its_own_way(
+    scenes: Path,
+) -> None:
+    """NGSIM names no targets: there, every complete window counts."""
+    data = opened(scenes, DataConfig(held_out=("1", "USA_Peach-2")), *DATA)
+    assert data.source.non_commercial
+    assert "NGSIM" in data.source.name
+    assert 0 < data.held_out.focal.sum() < len(data.held_out)
+
+
+def test_without_names_the_datas_own_split_counts(scenes: Path) -> None:
+    data = opened(scenes, DataConfig())
+    windows = data.pool.gather(np.arange(len(data.pool)))
+    assert not set(windows.recording) & set(data.held_out.recording)
+
+
+def test_nothing_to_train_on_and_nothing_to_measure_on_are_told(scenes: Path) -> None:
+    everything = tuple(str(number + 1) for number in range(SCENES))
+    with pytest.raises(EqrtError, match="nothing to train on"):
+        opened(scenes, DataConfig(held_out=everything))
+    with pytest.raises(EqrtError, match="group 99 is not here"):
+        opened(scenes, DataConfig(held_out=("99",)))

@@ -1,0 +1,1 @@
+"""Training data on disk: windows cut from recordings, in memory-mapped shards."""

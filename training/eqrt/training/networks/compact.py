@@ -1,0 +1,197 @@
+"""Our own predictor: few wide layers over one token per agent and one per centerline.
+
+    history ------> the target's frame --> agent tokens --+
+                                                          +--> transformer --> K mode queries
+    centerlines --> the target's frame --> lane tokens  --+          --> trajectories, turned back
+
+The paper's idea, taken to its end: not only the map but everything is read in the target's own
+frame, which turns with the world (`canonical.heading_vector`); so every feature is invariant, and a
+trajectory that is turned back is equivariant. A target without any direction (it stands, nothing
+measures its heading, no lane is near) has the zero matrix for a frame: it sees nothing that turns,
+and is predicted to stay on its course.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from eqrt.training.networks.canonical import (
+    canonical_from_tile,
+    heading_vector,
+    last_valid,
+    masked,
+    point_directions,
+)
+from eqrt.training.networks.config import UNIT_M, SceneConfig
+from eqrt.training.networks.layers import mlp
+from eqrt.training.networks.motion import COURSE, SLOPE_STEPS, MotionFit, fitted_vectors
+from eqrt.training.networks.time_basis import BASIS, time_basis
+
+_MASKED = -1e9  # a finite minus infinity: a row without any valid token must not become NaN
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompactConfig:
+    """Table [network] with kind = "compact"."""
+
+    width: int
+    """Of a token."""
+    heads: int
+    layers: int
+    """Transformer layers over all tokens."""
+    decoder_layers: int
+    """Layers in which the modes look at the tokens."""
+    dropout: float
+    """Share of updates dropped while training."""
+
+
+class CompactPredictor(nn.Module):
+    """One token per agent, one per centerline."""
+
+    def __init__(self, scene: SceneConfig, config: CompactConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.motion = MotionFit(scene)
+        seen = 2 + 2 * fitted_vectors(scene) + scene.history_steps
+        self.agent = mlp([seen, 2 * width, width])
+        self.lane = mlp([3 * scene.centerline_points, 2 * width, width])
+        self.norm = nn.LayerNorm(width)
+        self.layers = nn.ModuleList(
+            TokenLayer(width, config.heads, config.dropout) for _ in range(config.layers)
+        )
+        self.modes = ModeDecoder(scene, config)
+
+    def forward(
+        self,
+        history: Tensor,
+        history_valid: Tensor,
+        heading: Tensor,
+        centerlines: Tensor,
+        centerlines_valid: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Contract version 1: trajectories (B, K, H, 2) tile frame, probabilities (B, K)."""
+        history = masked(history, history_valid)
+        last = last_valid(history, history_valid)  # (B, N, 2)
+        origin = last[:, 0]
+        motion = self.motion(history, history_valid, last)
+        points = masked((centerlines - origin[:, None, None, :]) / UNIT_M, centerlines_valid)
+        canonical = self._frame(
+            motion.velocity[:, 0, :, COURSE], heading, points, centerlines_valid
+        )
+
+        exists = history_valid.any(-1)  # (B, N)
+        place = masked((last - origin.unsqueeze(1)) / UNIT_M, exists) @ canonical
+        turned = canonical.transpose(-1, -2).unsqueeze(1)  # (B, 1, 2, 2), for columns
+        features = torch.cat(
+            [
+                place,
+                (turned @ motion.vectors).flatten(2),
+                history_valid.to(place.dtype),
+            ],
+            -1,
+        )
+        lines = (points @ canonical.unsqueeze(1)).flatten(2)  # (B, Q, 2 L)
+        lines = torch.cat([lines, centerlines_valid.to(place.dtype)], -1)
+        tokens = self.norm(torch.cat([self.agent(features), self.lane(lines)], 1))
+        valid = torch.cat([exists, centerlines_valid.any(-1)], 1)  # (B, N + Q)
+        for layer in self.layers:
+            tokens = layer(tokens, tokens, valid)
+        velocity = turned[:, 0] @ motion.velocity[:, 0]  # (B, 2, S)
+        trajectories, probabilities = self.modes(tokens, valid, velocity)
+        back = canonical.transpose(-1, -2).unsqueeze(1)
+        return origin[:, None, None, :] + UNIT_M * (trajectories @ back), probabilities
+
+    def _frame(self, course: Tensor, heading: Tensor, points: Tensor, valid: Tensor) -> Tensor:
+        """The rotation (B, 2, 2) into the target's frame, for row vectors."""
+        direction, has_direction = point_directions(points, valid)
+        distance2 = points.square().sum(-1).flatten(1) * UNIT_M**2
+        usable = (valid & has_direction).flatten(1)
+        towards = heading_vector(
+            course * UNIT_M, heading, direction.flatten(1, 2), distance2, usable
+        )
+        return canonical_from_tile(towards)
+
+
+class TokenLayer(nn.Module):
+    """Attention and a perceptron, each added to what was there (pre-norm)."""
+
+    def __init__(self, width: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1 = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.project = nn.Linear(width, width)
+        self.norm2 = nn.LayerNorm(width)
+        self.perceptron = mlp([width, 2 * width, width])
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, tokens: Tensor, seen: Tensor, valid: Tensor) -> Tensor:
+        """Tokens (B, M, W) that look at the tokens seen (B, S, W), valid (B, S)."""
+        query = self._split(self.query(self.norm1(tokens)))
+        key, value = self.key_value(self.norm1(seen)).chunk(2, -1)
+        hidden = (~valid[:, None, None, :]).to(tokens.dtype) * _MASKED
+        score = query @ self._split(key).transpose(-1, -2) / query.shape[-1] ** 0.5
+        attended = ((score + hidden).softmax(-1) @ self._split(value)).transpose(1, 2).flatten(2)
+        tokens = tokens + self.dropout(self.project(attended))
+        updated: Tensor = tokens + self.dropout(self.perceptron(self.norm2(tokens)))
+        return updated
+
+    def _split(self, tokens: Tensor) -> Tensor:
+        batch, count, _ = tokens.shape
+        return tokens.view(batch, count, self.heads, -1).transpose(1, 2)  # (B, heads, M, W / heads)
+
+
+class ModeDecoder(nn.Module):
+    """K queries, one per mode, look at all tokens; each draws a trajectory.
+
+    A trajectory is the target's mean course, a mixture of its fitted velocities, plus smooth
+    functions of time that are 0 now.
+    """
+
+    time: Tensor
+    """(H,) seconds."""
+    basis: Tensor
+    """(BASIS, H)"""
+
+    def __init__(self, scene: SceneConfig, config: CompactConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.num_modes, self.steps = scene.num_modes, scene.horizon_steps
+        self.query = nn.Parameter(0.5 * torch.randn(scene.num_modes, width))
+        self.layers = nn.ModuleList(
+            TokenLayer(width, config.heads, config.dropout) for _ in range(config.decoder_layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.draw = mlp([width, 2 * width, 2 * BASIS + len(SLOPE_STEPS)])
+        with torch.no_grad():
+            list(self.draw.parameters())[-2].mul_(0.1)  # training starts near the mean course
+        self.logit = mlp([width, width, 1])
+        time = torch.arange(1, self.steps + 1) * scene.dt_s
+        self.register_buffer("time", time, persistent=False)
+        self.register_buffer("basis", time_basis(self.steps), persistent=False)
+
+    def forward(self, tokens: Tensor, valid: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+        """Tokens (B, M, W), the target's first; valid (B, M); its velocity (B, 2, S).
+
+        Returns (B, K, H, 2), relative to the target, in its frame, network units, and (B, K); the
+        most probable mode first.
+        """
+        queries = tokens[:, :1] + self.query
+        for layer in self.layers:
+            queries = layer(queries, tokens, valid)
+        queries = self.norm(queries)  # (B, K, W)
+        drawn = self.draw(queries)
+        share = drawn[..., 2 * BASIS :].softmax(-1)  # (B, K, S)
+        course = (share @ velocity.transpose(-1, -2)).unsqueeze(-2) * self.time.unsqueeze(-1)
+        shape = drawn[..., : 2 * BASIS].unflatten(-1, (2, BASIS)) @ self.basis  # (B, K, 2, H)
+        trajectories = course + shape.transpose(-1, -2)
+        probabilities = self.logit(queries).squeeze(-1).softmax(-1)
+        if self.num_modes == 1:
+            return trajectories, probabilities
+        probabilities, order = probabilities.topk(self.num_modes, dim=-1)
+        order = order[..., None, None].expand(-1, -1, self.steps, 2)
+        return trajectories.gather(1, order), probabilities

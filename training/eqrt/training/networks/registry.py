@@ -1,0 +1,67 @@
+"""Every kind of network by name, and how to build one from its configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from torch import nn
+
+from eqrt.training.networks.compact import CompactConfig, CompactPredictor
+from eqrt.training.networks.config import SceneConfig
+from eqrt.training.networks.eqmotion import EqMotion, EqMotionConfig
+from eqrt.training.networks.lstm import LstmBaseline, LstmConfig
+
+NETWORKS: Mapping[str, tuple[type[Any], type[nn.Module]]] = {
+    "compact": (CompactConfig, CompactPredictor),
+    "eqmotion": (EqMotionConfig, EqMotion),
+    "lstm": (LstmConfig, LstmBaseline),
+}
+"""Kind -> (its configuration, the network). A network is built from (SceneConfig, configuration)
+and maps the contract's inputs, in order, to its outputs."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelConfig:
+    """A scene and a network to read it: the tables [scene] and [network]."""
+
+    scene: SceneConfig
+    kind: str
+    """A key of NETWORKS."""
+    network: Any
+    """That kind's configuration."""
+
+    @classmethod
+    def from_tables(cls, scene: Mapping[str, Any], network: Mapping[str, Any]) -> ModelConfig:
+        """Raises ValueError that names the fields that are missing or unknown."""
+        kind = str(network.get("kind"))
+        if kind not in NETWORKS:
+            kinds = ", ".join(NETWORKS)
+            raise ValueError(f"[network] kind is {kind!r}, expected one of {kinds}")
+        settings = {name: value for name, value in network.items() if name != "kind"}
+        return cls(
+            scene=_fill(SceneConfig, scene, "scene"),
+            kind=kind,
+            network=_fill(NETWORKS[kind][0], settings, "network"),
+        )
+
+    def to_tables(self) -> dict[str, dict[str, Any]]:
+        """What `from_tables` reads."""
+        return {
+            "scene": asdict(self.scene),
+            "network": {"kind": self.kind, **asdict(self.network)},
+        }
+
+
+def build_network(config: ModelConfig) -> nn.Module:
+    """A new network with random weights (torch's global generator)."""
+    return NETWORKS[config.kind][1](config.scene, config.network)
+
+
+def _fill(kind: type[Any], values: Mapping[str, Any], table: str) -> Any:
+    names = {field.name for field in fields(kind)}
+    if set(values) != names:
+        wrong = ", ".join(sorted(names ^ set(values)))
+        raise ValueError(f"[{table}] has missing or unknown fields: {wrong}")
+    return kind(**values)

@@ -1,0 +1,76 @@
+"""The course of a training as pictures: `loss.png`, `loss.svg`, `errors.png`, `errors.svg`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from eqrt.training.progress import Numbers, read_lines
+
+FORMATS = ("png", "svg")
+_ERRORS = ("ade_3s", "fde_3s", "min_ade", "min_fde")
+_SIZE_INCHES = (7.0, 4.0)
+_SPREAD = 20.0  # above this ratio of largest to smallest a logarithmic axis shows more
+
+
+def plot_metrics(log: Path, folder: Path, baseline: Numbers) -> list[Path]:
+    """Draw what `log` holds into `folder`; what there is nothing of yet is not drawn.
+
+    `baseline` is what constant velocity scores, dashed. Returns the files written.
+    """
+    lines = read_lines(log)
+    written = []
+    if lines:
+        written += _save(_figure(lines, ["loss"], {}, "loss"), folder / "loss")
+    if evaluated := [line for line in lines if "ade_3s" in line]:
+        names = [name for name in _ERRORS if name in evaluated[0]]
+        figure = _figure(evaluated, names, baseline, "metres, held-out targets")
+        written += _save(figure, folder / "errors")
+    return written
+
+
+def _figure(
+    lines: Sequence[Numbers], names: Sequence[str], baseline: Numbers, label: str
+) -> Figure:
+    figure = Figure(_SIZE_INCHES, layout="constrained")
+    axes = figure.add_subplot()
+    steps = [line["step"] for line in lines]
+    for name in names:
+        values = [line[name] for line in lines]
+        marker = "o" if len(values) < 50 else ""
+        (drawn,) = axes.plot(steps, values, label=_spoken(name), marker=marker, markersize=3)
+        if name in baseline:
+            axes.axhline(
+                baseline[name],
+                color=drawn.get_color(),
+                linestyle="--",
+                linewidth=0.8,
+                label=f"{_spoken(name)}, constant velocity",
+            )
+    everything = [line[name] for line in lines for name in names]
+    if 0.0 < min(everything) < max(everything) / _SPREAD:
+        axes.set_yscale("log")
+    axes.set_xlabel("step")
+    axes.set_ylabel(label)
+    axes.grid(visible=True, linewidth=0.3)
+    if len(names) > 1 or baseline:
+        axes.legend(fontsize="small")
+    return figure
+
+
+def _spoken(name: str) -> str:
+    """`min_ade_3s` -> `min ADE 3 s`."""
+    words = name.replace("_", " ").replace("ade", "ADE").replace("fde", "FDE")
+    return words.removesuffix("s") + " s" if words[-2:-1].isdigit() else words
+
+
+def _save(figure: Figure, path: Path) -> list[Path]:
+    """Every format; the same figure gives the same SVG, byte for byte."""
+    written = [path.with_suffix(f".{kind}") for kind in FORMATS]
+    with mpl.rc_context({"svg.hashsalt": "eqrt"}):
+        figure.savefig(written[0], dpi=120)
+        figure.savefig(written[1], metadata={"Date": None})
+    return written

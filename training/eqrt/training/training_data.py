@@ -1,0 +1,104 @@
+"""What a training learns from, and what it is measured on, from one or several datasets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eqrt.core.errors import EqrtError
+from eqrt.training.configuration import DataConfig, TrainConfig
+from eqrt.training.dataset.split import Split
+from eqrt.training.dataset.store import WindowStore, open_data
+from eqrt.training.dataset.windows import MIN_DRIVE_M, Windows, join
+from eqrt.training.recordings.recording import Source
+from eqrt.training.sampling import Pool, Rows
+
+_CHUNK = 4096
+"""Windows looked at together."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingData:
+    """Windows to train on, windows to evaluate on, and whose they are."""
+
+    pool: Pool
+    held_out: Windows
+    """Complete windows; of the dataset's own targets where it names them."""
+    source: Source
+
+
+def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingData:
+    """Open prepared folders, or datasets as they are (which are cut into memory).
+
+    Raises EqrtError if there is nothing to train on or nothing to evaluate on, or if something that
+    is to be held out is nowhere.
+    """
+    contract = config.model.scene.contract(config.name, "0.0.0")
+    options = config.data.window_options()
+    stores = [open_data(path, contract, options=options) for path in paths]
+    where = ", ".join(map(str, paths))
+    if config.data.held_out:
+        stores = _split(stores, config.data.held_out, where)
+    store = WindowStore.concat(stores)
+    rows = store.rows("train")
+    if not len(rows):
+        raise EqrtError(f"{where}: every recording here is held out; nothing to train on")
+    held_out = join([measured_windows(store, "val") for store in stores])
+    if not len(held_out):
+        count = len(store.rows("val"))
+        raise EqrtError(
+            f"{where}: nothing to evaluate on: none of the {count} windows held out has a whole "
+            "history and future; hold out more, or longer recordings"
+        )
+    pool = Pool(store, rows, _weights(config.data, store, rows))
+    return TrainingData(pool, held_out, store.source)
+
+
+def measured_windows(store: WindowStore, split: str) -> Windows:
+    """The windows of one side that a model is measured on.
+
+    They are complete, and of the dataset's own targets where it names any.
+    """
+    rows = store.rows(split)
+    focal = store.column("focal")[rows]
+    return store.gather(rows[focal] if focal.any() else rows).complete()
+
+
+def _split(stores: Sequence[WindowStore], held_out: Sequence[str], where: str) -> list[WindowStore]:
+    """Hold out what is named, in whichever of the stores it is, and nothing else."""
+    split, found = [], set[str]()
+    for store in stores:
+        names = {name for entry in store.recordings for name in (entry.name, entry.group)}
+        here = tuple(name for name in held_out if name in names)
+        found.update(here)
+        split.append(store.split_by(Split(held_out=here, held_out_share=0.0)))
+    missing = sorted(set(held_out) - found)
+    if missing:
+        raise EqrtError(f"{where}: held-out recording or group {missing[0]} is not here")
+    return split
+
+
+def _weights(config: DataConfig, store: WindowStore, rows: Rows) -> NDArray[np.float64]:
+    """How often each of the rows is drawn in an epoch."""
+    kinds, weights = [store.column("focal")[rows]], [config.focal_weight]
+    if config.driving_weight != config.standing_weight:  # to tell them apart takes reading them all
+        kinds.append(_drive(store, rows))
+        weights.append(config.driving_weight)
+    return np.select(kinds, weights, config.standing_weight)
+
+
+def _drive(store: WindowStore, rows: Rows) -> NDArray[np.bool_]:
+    """Whether the target moves, from where it was first seen to where it was last."""
+    drive = np.zeros(len(rows), np.bool_)
+    for first in range(0, len(rows), _CHUNK):
+        windows = store.gather(rows[first : first + _CHUNK])
+        path = np.concatenate([windows.history[:, 0], windows.future], axis=1)
+        seen = np.concatenate([windows.history_valid[:, 0], windows.future_valid], axis=1)
+        row, last = np.arange(len(path)), seen.shape[1] - 1
+        moved = path[row, last - seen[:, ::-1].argmax(axis=1)] - path[row, seen.argmax(axis=1)]
+        drive[first : first + _CHUNK] = np.hypot(*moved.T) >= MIN_DRIVE_M
+    return drive
