@@ -232,3 +232,19 @@ def test_a_slowly_stopping_target_is_predicted_without_a_jump(model: CompactPred
     between = np.linspace(speeds[at], speeds[at + 1], 11)
     finer = np.linalg.norm(np.diff(ends(between), axis=0), axis=-1)
     assert finer.max() < 0.3 * moved[at]
+
+
+def test_in_bfloat16_the_prediction_moves_by_its_features_not_by_its_positions() -> None:
+    """Far from the target bfloat16 knows positions to a metre; only what is learned may feel it.
+
+    Fresh weights hardly draw, so that what remains is the course, in float32.
+    """
+    torch.manual_seed(2)
+    model = CompactPredictor(SCENE, CONFIG).eval()
+    inputs = [torch.from_numpy(value) for value in SCENES["driving"].inputs().values()]
+    with torch.no_grad():
+        expected, _ = model(*inputs)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded, _ = model(*inputs)
+    assert rounded.dtype == torch.float32
+    assert 0.0 < float((rounded - expected).abs().max()) < 0.1

@@ -25,7 +25,7 @@ from source_tree import ROOT
 from tiny_training import DATA, NGSIM, TOML, tiny, tiny_data, tiny_file
 from window_samples import packed_scenes
 
-SHIPPED = load_config(ROOT / "training/configs/eqrt-ngsim.toml")
+SHIPPED = load_config(ROOT / "training/configs/eqrt-free.toml")
 
 
 def command(config: Path, out: Path, *more: str, data: tuple[Path, ...] = DATA) -> list[str]:

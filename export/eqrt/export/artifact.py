@@ -90,6 +90,11 @@ def _write_vector(model: nn.Module, scene: Scene, folder: Path, name: str) -> No
     (folder / "name.txt").write_text(name + "\n", encoding="utf-8")
 
 
+def _anywhere(command: str) -> str:
+    """A command line without the folders of the machine that it ran on."""
+    return re.sub(r"(?<=\s)\S*/(?=\S)", "", command)
+
+
 def _metric(name: str) -> str:
     """How a table calls a metric: `ade_3s` is ADE 3 s."""
     if of_mean := re.fullmatch(r"(ade|fde)_(\d+)s", name):
@@ -141,7 +146,7 @@ centerlines around it become {modes} of {contract.horizon_steps * contract.dt_s:
 | data | {card.data} |
 | licence of the weights | {card.license}{", non-commercial" if card.non_commercial else ""} |
 | parameters | {card.parameters} |
-| trained by | `{card.command}`, {card.steps} steps, seed {card.seed} |
+| trained by | `{_anywhere(card.command)}`, {card.steps} steps, seed {card.seed} |
 | its configuration | SHA-256 {card.config_sha256[:16]} |
 | contract | version 1, `contract.json` |
 | check | `sha256sum -c SHA256SUMS`; `test_data_set_*` hold inputs and expected outputs |

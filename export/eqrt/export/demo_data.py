@@ -1,6 +1,6 @@
 """Makes the recordings of `eqrt demo`: `python -m eqrt.export.demo_data NGSIM_FOLDER RAV4_LOG OUT`.
 
-Every NGSIM scenario in it is held out of training (training/configs/eqrt-ngsim.toml).
+Every NGSIM scenario in it is held out of training (training/configs/eqrt-free.toml).
 """
 
 from __future__ import annotations

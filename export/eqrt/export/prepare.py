@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt prepare`."""
     parser.epilog = (
         "example: eqrt prepare argoverse1/train/data --out prepared --config training/configs/"
-        "eqrt-ngsim.toml. Formats and numbers: docs/data.md"
+        "eqrt-free.toml. Formats and numbers: docs/data.md"
     )
     parser.add_argument("data", type=Path, metavar="DATA", help="the recorded traffic")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="new, or its own")

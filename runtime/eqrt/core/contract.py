@@ -31,7 +31,7 @@ class ModelContract:
     """Sizes and units the exported graph was built for. B (targets) is the only dynamic axis."""
 
     name: str
-    """Which network this is, for example `eqrt-ngsim`."""
+    """Which network this is, for example `eqrt-free`."""
     version: str
     """MAJOR.MINOR.PATCH of the artifact; MAJOR = inputs or meaning changed."""
     num_agents: int

@@ -73,7 +73,7 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
     batch = _mirrored(batch, chance(config.mirrored, windows))
     steps = batch["history_valid"].shape[2]
     lines = batch["centerlines_valid"].shape[1]
-    first = torch.randint(0, steps - 1, (windows, 1, 1), generator=generator)
+    first = torch.randint(0, steps, (windows, 1, 1), generator=generator)
     late = chance(config.short_history, windows, 1, 1) & (torch.arange(steps) < first)
     drop = late | chance(config.missing_step, windows, agents, steps)
     hidden = chance(config.hidden_neighbour, windows, agents, 1)
@@ -156,9 +156,7 @@ def _noise(history: Tensor, config: AugmentConfig, generator: torch.Generator) -
 
 def _offset_lines(lines: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:
     """Every line (B, Q, L, 2) shifted as a whole."""
-    return lines + config.line_offset_m * torch.randn(
-        (*lines.shape[:2], 1, 2), generator=generator
-    )
+    return lines + config.line_offset_m * torch.randn((*lines.shape[:2], 1, 2), generator=generator)
 
 
 def _heading(heading: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:

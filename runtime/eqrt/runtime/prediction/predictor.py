@@ -25,7 +25,7 @@ from eqrt.runtime.prediction.tensor_proto import read_tensor
 if TYPE_CHECKING:
     import onnxruntime
 
-DEFAULT_ARTIFACT = Path(__file__).parent / "models" / "eqrt-ngsim"
+DEFAULT_ARTIFACT = Path(__file__).parent / "models" / "eqrt-free"
 """The model that ships with eqrt."""
 SELF_CHECK_M = 1e-3
 """A test vector must come back within a millimetre."""

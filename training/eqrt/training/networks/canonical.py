@@ -8,6 +8,8 @@ No angle is ever formed: with the unit heading u, the rotation is [[u_x, u_y], [
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from torch import Tensor
 
@@ -22,6 +24,17 @@ NEAR_M = 1.0
 _TINY = 1e-3
 """A millimetre, where lengths meet zero. Its square must stay well above 1e-8: the ONNX exporter's
 optimiser takes an added constant below that for zero and drops it."""
+
+
+def exact(like: Tensor) -> AbstractContextManager[object]:
+    """Where positions are added and turned: no bfloat16, which knows 50 m in steps of 0.25 m.
+
+    Without autocast (on the CPU, and when a graph is exported) it does nothing.
+    """
+    kind = like.device.type
+    if torch.is_autocast_enabled(kind):
+        return torch.autocast(kind, enabled=False)
+    return nullcontext()
 
 
 def masked(values: Tensor, valid: Tensor) -> Tensor:

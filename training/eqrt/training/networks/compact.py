@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from eqrt.training.networks.canonical import (
     canonical_from_tile,
+    exact,
     heading_vector,
     last_valid,
     masked,
@@ -73,36 +74,46 @@ class CompactPredictor(nn.Module):
         centerlines_valid: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Contract version 1: trajectories (B, K, H, 2) tile frame, probabilities (B, K)."""
+        with exact(history):
+            seen = self._see(history, history_valid, heading, centerlines, centerlines_valid)
+        tokens = self.norm(torch.cat([self.agent(seen.agents), self.lane(seen.lines)], 1))
+        for layer in self.layers:
+            tokens = layer(tokens, tokens, seen.valid)
+        trajectories, probabilities = self.modes(tokens, seen.valid, seen.velocity)
+        with exact(history):
+            turned_back = trajectories @ seen.canonical.transpose(-1, -2).unsqueeze(1)
+            return seen.origin[:, None, None, :] + UNIT_M * turned_back, probabilities
+
+    def _see(
+        self,
+        history: Tensor,
+        history_valid: Tensor,
+        heading: Tensor,
+        centerlines: Tensor,
+        centerlines_valid: Tensor,
+    ) -> _Seen:
+        """The contract's inputs, from the target's own frame."""
         history = masked(history, history_valid)
         last = last_valid(history, history_valid)  # (B, N, 2)
         origin = last[:, 0]
         motion = self.motion(history, history_valid, last)
         points = masked((centerlines - origin[:, None, None, :]) / UNIT_M, centerlines_valid)
-        canonical = self._frame(
-            motion.velocity[:, 0, :, COURSE], heading, points, centerlines_valid
-        )
+        course = motion.velocity[:, 0, :, COURSE]
+        canonical = self._frame(course, heading, points, centerlines_valid)
+        turn = canonical.transpose(-1, -2).unsqueeze(1)  # (B, 1, 2, 2), for columns
 
         exists = history_valid.any(-1)  # (B, N)
         place = masked((last - origin.unsqueeze(1)) / UNIT_M, exists) @ canonical
-        turned = canonical.transpose(-1, -2).unsqueeze(1)  # (B, 1, 2, 2), for columns
-        features = torch.cat(
-            [
-                place,
-                (turned @ motion.vectors).flatten(2),
-                history_valid.to(place.dtype),
-            ],
-            -1,
-        )
+        vectors = (turn @ motion.vectors).flatten(2)
         lines = (points @ canonical.unsqueeze(1)).flatten(2)  # (B, Q, 2 L)
-        lines = torch.cat([lines, centerlines_valid.to(place.dtype)], -1)
-        tokens = self.norm(torch.cat([self.agent(features), self.lane(lines)], 1))
-        valid = torch.cat([exists, centerlines_valid.any(-1)], 1)  # (B, N + Q)
-        for layer in self.layers:
-            tokens = layer(tokens, tokens, valid)
-        velocity = turned[:, 0] @ motion.velocity[:, 0]  # (B, 2, S)
-        trajectories, probabilities = self.modes(tokens, valid, velocity)
-        back = canonical.transpose(-1, -2).unsqueeze(1)
-        return origin[:, None, None, :] + UNIT_M * (trajectories @ back), probabilities
+        return _Seen(
+            origin=origin,
+            canonical=canonical,
+            agents=torch.cat([place, vectors, history_valid.to(place.dtype)], -1),
+            lines=torch.cat([lines, centerlines_valid.to(place.dtype)], -1),
+            valid=torch.cat([exists, centerlines_valid.any(-1)], 1),
+            velocity=turn[:, 0] @ motion.velocity[:, 0],
+        )
 
     def _frame(self, course: Tensor, heading: Tensor, points: Tensor, valid: Tensor) -> Tensor:
         """The rotation (B, 2, 2) into the target's frame, for row vectors."""
@@ -113,6 +124,24 @@ class CompactPredictor(nn.Module):
             course * UNIT_M, heading, direction.flatten(1, 2), distance2, usable
         )
         return canonical_from_tile(towards)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A scene as the target sees it; only `origin` and `canonical` know where that is."""
+
+    origin: Tensor
+    """(B, 2) the target now, tile frame."""
+    canonical: Tensor
+    """(B, 2, 2) turns into the target's frame, for row vectors."""
+    agents: Tensor
+    """(B, N, .) where each agent is, how it moved, and when it was seen."""
+    lines: Tensor
+    """(B, Q, 3 L) the points of each centerline, and which exist."""
+    valid: Tensor
+    """(B, N + Q) which agents and lines exist."""
+    velocity: Tensor
+    """(B, 2, S) the target's fitted velocities."""
 
 
 class TokenLayer(nn.Module):
@@ -184,12 +213,13 @@ class ModeDecoder(nn.Module):
         for layer in self.layers:
             queries = layer(queries, tokens, valid)
         queries = self.norm(queries)  # (B, K, W)
-        drawn = self.draw(queries)
-        share = drawn[..., 2 * BASIS :].softmax(-1)  # (B, K, S)
-        course = (share @ velocity.transpose(-1, -2)).unsqueeze(-2) * self.time.unsqueeze(-1)
-        shape = drawn[..., : 2 * BASIS].unflatten(-1, (2, BASIS)) @ self.basis  # (B, K, 2, H)
-        trajectories = course + shape.transpose(-1, -2)
         probabilities = self.logit(queries).squeeze(-1).softmax(-1)
+        drawn = self.draw(queries).to(velocity.dtype)
+        with exact(velocity):
+            share = drawn[..., 2 * BASIS :].softmax(-1)  # (B, K, S)
+            course = (share @ velocity.transpose(-1, -2)).unsqueeze(-2) * self.time.unsqueeze(-1)
+            shape = drawn[..., : 2 * BASIS].unflatten(-1, (2, BASIS)) @ self.basis  # (B, K, 2, H)
+            trajectories = course + shape.transpose(-1, -2)
         if self.num_modes == 1:
             return trajectories, probabilities
         probabilities, order = probabilities.topk(self.num_modes, dim=-1)

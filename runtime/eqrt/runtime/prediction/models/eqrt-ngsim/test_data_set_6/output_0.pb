@@ -1,1 +1,0 @@
-BtrajectoriesJП²ывцлLTC·ывцъLTC·ывцЗLTC⌡ывцMTC≤ывц/MTC⌠ывц@MTC▐ывцIMTC┼ывцLMTC├ывцJMTC└ывцCMTC┐ывц<MTC└ывц4MTC┤ывц/MTC▄ывц-MTC▓ывц/MTC ывц4MTCёывц=MTC╜ывцHMTC╥ывцTMTCбывцaMTCлывцmMTCвывцwMTCАывц┌MTCНывц▌MTCЩывц╒MTCзвццMTC+звцЩMTCQзвц^NTC├звцЗNTCпзвцЙOTC
