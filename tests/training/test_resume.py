@@ -119,12 +119,12 @@ def begun(tmp_path: Path) -> Path:
 
 
 def test_the_state_of_another_configuration_says_which_fields_differ(begun: Path) -> None:
-    other = tiny({"train": {"seed": 5, "steps": 2}, "network": {"width": 16}})
+    other = tiny({"train": {"seed": 5, "steps": 2}, "network": {"width": 32}})
     with pytest.raises(EqrtError) as refused:
         train(other, tiny_data(), begun, resume=True)
     said = str(refused.value)
     assert "another configuration" in said
-    assert "[network] width (8 there, 16 here)" in said
+    assert "[network] width (16 there, 32 here)" in said
     assert "[train] seed (1 there, 5 here)" in said
     assert "batch_size" not in said
 

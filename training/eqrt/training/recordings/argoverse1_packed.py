@@ -82,7 +82,8 @@ class PackedArgoverse1Reader:
 def _arrays(path: str) -> Arrays:
     """The arrays of one file, their sizes checked."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here: np.load leaves a file that it cannot read open.
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             missing = sorted(set(_NEEDED) - set(file.files))
             if missing:
                 raise LogError(
