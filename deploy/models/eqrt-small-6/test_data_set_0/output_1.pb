@@ -1,0 +1,1 @@
+BprobabilitiesJзеr>Жg>}8:>х<3>рY└=¤c░=

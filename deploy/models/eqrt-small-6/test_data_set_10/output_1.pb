@@ -1,0 +1,1 @@
+BprobabilitiesJfº‹>È/h>O,N>þÙ>…úÑ=__Y=

@@ -1,0 +1,2 @@
+BprobabilitiesJl¥r>†g>h8:>
+=3>-ZÀ=ùc°=

@@ -1,0 +1,1 @@
+BprobabilitiesJÖ¹> jŒ>`ho>Ìœ>ëœ„=I7v<

@@ -1,0 +1,1 @@
+BprobabilitiesJrL¦>¼Þ›>MÙ_>Q¡Ï=gí*=LE<

@@ -1,0 +1,1 @@
+BprobabilitiesJyL¦>¼Þ›>MÙ_>H¡Ï=Rí*=,E<
