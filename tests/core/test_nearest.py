@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
+from eqrt.core.lane_choice import centerline_source
 from eqrt.core.lanes import Lane, build_lane_map, evenly_spaced
-from eqrt.core.nearest import NearestLanes, centerline_source
+from eqrt.core.nearest import NearestLanes
 from eqrt.core.routes import RouteFinder
 
 NOWHERE = np.zeros((1, 2))

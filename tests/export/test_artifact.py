@@ -158,9 +158,9 @@ def test_the_contract_is_in_the_file_and_beside_it(artifact: Path) -> None:
 
 
 def test_the_runtime_says_when_a_model_may_not_be_sold(artifact: Path, shipped: Predictor) -> None:
-    notice = Predictor.load(artifact).licence_notice
+    notice = Predictor.load(artifact).license_notice
     assert notice == "model licence: Apache-2.0, non-commercial (test)"
-    assert shipped.licence_notice is None
+    assert shipped.license_notice is None
 
 
 def test_the_same_network_exports_to_the_same_bytes(model: CompactPredictor) -> None:

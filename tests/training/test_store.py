@@ -17,7 +17,7 @@ from eqrt.training.dataset import prepared, store
 from eqrt.training.dataset.pieces import Counts, RawData, ShardCutter, plan
 from eqrt.training.dataset.prepared import Geometry, Settings
 from eqrt.training.dataset.split import Split
-from eqrt.training.dataset.store import WindowStore, join_sources, licence_notice, open_data
+from eqrt.training.dataset.store import WindowStore, join_sources, license_notice, open_data
 from eqrt.training.dataset.windows import WindowCutter, WindowOptions, Windows, join
 from eqrt.training.recordings.commonroad_recordings import NGSIM as NGSIM_SOURCE
 from eqrt.training.recordings.formats import FORMATS, ReaderOptions
@@ -252,10 +252,10 @@ def test_datasets_for_different_models_cannot_be_joined(packed: Path) -> None:
 
 
 def test_a_non_commercial_licence_is_told(packed: Path) -> None:
-    notice = licence_notice(open_data(packed, CONTRACT).source)
+    notice = license_notice(open_data(packed, CONTRACT).source)
     assert notice is not None
     assert notice.startswith("data licence: CC-BY-NC-SA-4.0, non-commercial; Argoverse 1")
-    assert licence_notice(NGSIM_SOURCE) is None
+    assert license_notice(NGSIM_SOURCE) is None
 
 
 def test_a_wrong_path_says_what_was_expected(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,3 +43,24 @@ CAN = Format(
 )
 FORMATS: tuple[Format, ...] = (*formats.FORMATS, CAN)
 """The first that fits counts."""
+
+
+def add_reader_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """What `ReaderOptions` asks for, for every command that reads recorded traffic."""
+    reader = parser.add_argument_group("reading recorded traffic")
+    reader.add_argument(
+        "--maps", type=Path, metavar="FOLDER", help="Argoverse 1: the cities' maps, map_files"
+    )
+    reader.add_argument("--profile", metavar="NAME|FILE", help="CAN logs: which sensor sent")
+    reader.add_argument("--tile", type=Path, metavar="FILE", help="CAN logs: the map around")
+    reader.add_argument(
+        "--can",
+        action="append",
+        default=[],
+        metavar="[ROLE=]NAME",
+        help="CAN logs: read only the channel NAME (repeatable)",
+    )
+    reader.add_argument(
+        "--stationary", action="store_true", help="CAN logs: the sensor stood still"
+    )
+    return reader

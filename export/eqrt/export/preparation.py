@@ -18,7 +18,7 @@ from eqrt.training.dataset.pieces import Counts, Piece, RawData, ShardCutter, pe
 from eqrt.training.dataset.prepared import Geometry, Settings
 from eqrt.training.dataset.shards import ShardIndex, open_shard, remove_unfinished, shard_folder
 from eqrt.training.dataset.split import Split
-from eqrt.training.dataset.store import licence_notice, no_windows_error, open_data
+from eqrt.training.dataset.store import license_notice, no_windows_error, open_data
 
 NAMED_SKIPS = 5
 """So many of what was skipped are named; all are in skipped.txt."""
@@ -172,7 +172,7 @@ def _report(folder: Path, contract: ModelContract) -> None:
         print("one side of the split is empty; few groups: name some with --held-out-groups")
     if totals.skipped:
         _report_skipped(folder, totals.skipped)
-    if notice := licence_notice(settings.source):
+    if notice := license_notice(settings.source):
         print(notice)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import ContractError, UsageError
 from eqrt.export.cluster import add_worker_arguments
-from eqrt.export.formats import FORMATS
+from eqrt.export.formats import FORMATS, add_reader_arguments
 from eqrt.export.preparation import prepare
 from eqrt.training.configuration import load_config
 from eqrt.training.dataset.pieces import RawData
@@ -76,26 +76,11 @@ def _add_split_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_reader_arguments(parser: argparse.ArgumentParser) -> None:
-    reader = parser.add_argument_group("reading")
+    reader = add_reader_arguments(parser)
     reader.add_argument(
         "--format",
         metavar="NAME",
         help=f"of DATA: {', '.join(kind.name for kind in FORMATS)} (default: told by the files)",
-    )
-    reader.add_argument(
-        "--maps", type=Path, metavar="FOLDER", help="Argoverse 1: the cities' maps, map_files"
-    )
-    reader.add_argument("--profile", metavar="NAME|FILE", help="CAN logs: which sensor sent")
-    reader.add_argument("--tile", type=Path, metavar="FILE", help="CAN logs: the map around")
-    reader.add_argument(
-        "--can",
-        action="append",
-        default=[],
-        metavar="[ROLE=]NAME",
-        help="CAN logs: read only the channel NAME (repeatable)",
-    )
-    reader.add_argument(
-        "--stationary", action="store_true", help="CAN logs: the sensor stood still"
     )
     reader.add_argument(
         "--license", metavar="NAME", help="CAN logs, CommonRoad: under which the data may be used"

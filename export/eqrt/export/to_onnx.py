@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import warnings
 
@@ -42,6 +43,8 @@ def _export(model: nn.Module, contract: ModelContract) -> onnx.ModelProto:
         for kind, shape in contract.inputs.values()
     )
     batch = torch.export.Dim("B")
+    # It tells of every package that it would know operators of and that is not installed.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter warns about its own internals
         program = torch.onnx.export(

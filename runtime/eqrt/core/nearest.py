@@ -12,24 +12,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.contract import ModelContract
 from eqrt.core.lane_grid import LaneGrid
 from eqrt.core.lane_lines import LaneLines, from_complex, to_complex
 from eqrt.core.lanes import LaneMap
-from eqrt.core.routes import RouteFinder
-from eqrt.core.scene import CenterlineSource
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 REACH_M = 50.0
-
-
-def centerline_source(lane_map: LaneMap, contract: ModelContract) -> CenterlineSource:
-    """What finds the centerlines that a model was trained with, on `lane_map`."""
-    if contract.lane_choice == "nearest":
-        return NearestLanes(lane_map)
-    return RouteFinder(lane_map)
 
 
 class NearestLanes:

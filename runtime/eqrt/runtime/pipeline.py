@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
-from eqrt.core.nearest import centerline_source
+from eqrt.core.lane_choice import centerline_source
 from eqrt.core.scene import AgentHistories, Scene, build_scene, concatenate, tile_origin
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose

@@ -129,8 +129,8 @@ def load_pipeline(
 ) -> Pipeline:
     """The pipeline that `add_pipeline_arguments` describes; the others are as for Pipeline."""
     predictor = Predictor.load(args.model)
-    if predictor.licence_notice:
-        print(f"eqrt: {predictor.licence_notice}", file=sys.stderr)
+    if predictor.license_notice:
+        print(f"eqrt: {predictor.license_notice}", file=sys.stderr)
     return Pipeline(
         profile,
         predictor,

@@ -25,7 +25,7 @@ from torch.optim import Optimizer
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.training.augment import Batch
 from eqrt.training.configuration import LoopConfig, TrainConfig, load_config
-from eqrt.training.dataset.store import licence_notice
+from eqrt.training.dataset.store import license_notice
 from eqrt.training.evaluate import INPUTS
 from eqrt.training.loader import BatchMaker, Loader
 from eqrt.training.losses import LOSSES
@@ -221,7 +221,7 @@ def _introduce(config: TrainConfig, data: TrainingData, ranks: Ranks, display: D
     """What is trained, on what, and whether one may sell the result."""
     display.line(f"training windows    {len(data.pool)}, {data.pool.samples_per_epoch} an epoch")
     display.line(f"held-out targets    {len(data.held_out)}")
-    display.line(licence_notice(data.source) or f"data licence        {data.source.license}")
+    display.line(license_notice(data.source) or f"data licence        {data.source.license}")
     if ranks.world > 1:
         share = config.train.batch_size // ranks.world
         display.line(f"processes           {ranks.world}, {share} windows of every batch each")

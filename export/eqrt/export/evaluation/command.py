@@ -14,6 +14,7 @@ from eqrt.export.cluster import add_worker_arguments, run_pieces
 from eqrt.export.evaluation.measure import Measured, Piece, Settings, measure_piece
 from eqrt.export.evaluation.report import as_json, as_text, write_json
 from eqrt.export.evaluation.selection import Choice
+from eqrt.export.formats import add_reader_arguments
 from eqrt.training.dataset.split import SIDES
 from eqrt.training.dataset.windows import TARGETS
 from eqrt.training.recordings.formats import ReaderOptions
@@ -63,26 +64,7 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
         "--batch", type=positive, default=256, metavar="N", help="windows at a time (default 256)"
     )
     parser.add_argument("--threads", type=positive, default=1, help="CPU threads (default 1)")
-    _add_reader_arguments(parser)
-
-
-def _add_reader_arguments(parser: argparse.ArgumentParser) -> None:
-    reader = parser.add_argument_group("reading raw data")
-    reader.add_argument(
-        "--maps", type=Path, metavar="FOLDER", help="Argoverse 1: the cities' maps, map_files"
-    )
-    reader.add_argument("--profile", metavar="NAME|FILE", help="CAN logs: which sensor sent")
-    reader.add_argument("--tile", type=Path, metavar="FILE", help="CAN logs: the map around")
-    reader.add_argument(
-        "--can",
-        action="append",
-        default=[],
-        metavar="[ROLE=]NAME",
-        help="CAN logs: read only the channel NAME (repeatable)",
-    )
-    reader.add_argument(
-        "--stationary", action="store_true", help="CAN logs: the sensor stood still"
-    )
+    add_reader_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ from eqrt.core.errors import EqrtError
 from eqrt.export.evaluation.measure import MODEL, PUBLISHED, REFUSED, DataCard, Measured, Settings
 from eqrt.export.evaluation.predictors import ModelCard
 from eqrt.export.evaluation.tally import GROUPS, Tally, horizons_s, mode_counts
-from eqrt.training.dataset.store import licence_notice
+from eqrt.training.dataset.store import license_notice
 from eqrt.training.recordings.recording import Source
 
 SCHEMA = 1
@@ -123,7 +123,7 @@ def _settings_line(settings: Settings) -> str:
 def _license_lines(model: ModelCard, sources: Sequence[Source]) -> list[str]:
     """Said only where a licence forbids commercial use."""
     said = [f"model licence: {model.license}, non-commercial"] if model.non_commercial else []
-    notices = [licence_notice(source) for source in dict.fromkeys(sources)]
+    notices = [license_notice(source) for source in dict.fromkeys(sources)]
     said += [notice for notice in notices if notice is not None]
     return [line for text in said for line in textwrap.wrap(text, WIDTH, subsequent_indent="  ")]
 

@@ -101,7 +101,7 @@ class Predictor:
         return Prediction(trajectories + scene.origin, probabilities)
 
     @property
-    def licence_notice(self) -> str | None:
+    def license_notice(self) -> str | None:
         """The line to print when the weights may not be used commercially, else None."""
         if not self.non_commercial:
             return None

@@ -248,7 +248,7 @@ def join_sources(sources: Sequence[Source]) -> Source:
     )
 
 
-def licence_notice(source: Source) -> str | None:
+def license_notice(source: Source) -> str | None:
     """The line to print when a source forbids commercial use, None where it does not."""
     if not source.non_commercial:
         return None

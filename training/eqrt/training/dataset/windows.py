@@ -13,8 +13,8 @@ from torch import Tensor
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import LogError
+from eqrt.core.lane_choice import centerline_source
 from eqrt.core.lanes import LaneMap
-from eqrt.core.nearest import centerline_source
 from eqrt.core.scene import AgentHistories, CenterlineSource, Scene, build_scene, tile_origin
 from eqrt.training.recordings.recording import Recording
 

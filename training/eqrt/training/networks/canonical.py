@@ -13,8 +13,6 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
-MOTION_STEPS = 10
-"""Motion is measured over the last second."""
 CRAWL_M = 0.3
 """Motion below this (per second) is sensor noise: it says nothing about heading."""
 DRIVE_M = 1.2

@@ -49,6 +49,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FOLDER", help="a new folder for the recordings"
     )
+    _add_amount_arguments(parser)
+    _add_traffic_arguments(parser)
+    parser.add_argument(
+        "--credit", default="", metavar="TEXT", help="added to the credits: whose the scenarios are"
+    )
+    parser.add_argument(
+        "--license",
+        default="CC0-1.0",
+        metavar="SPDX",
+        help="of the recordings, which hold the scenarios' lanes (default CC0-1.0)",
+    )
+    parser.add_argument("--jobs", type=_count_of(1), default=1, help="processes (default 1)")
+
+
+def _add_amount_arguments(parser: argparse.ArgumentParser) -> None:
     amount = parser.add_mutually_exclusive_group()
     amount.add_argument("--minutes", type=_above(0.0), metavar="M", help="recorded, in total")
     amount.add_argument(
@@ -58,6 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=_above(1.0), default=30.0, help="length of a recording (default 30)"
     )
     parser.add_argument("--seed", type=_count_of(0), default=1, help="(default 1)")
+
+
+def _add_traffic_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--begin",
         type=_from(0.0),
@@ -91,16 +109,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sensor", choices=SENSORS, default="good", help="how well others are seen (default good)"
     )
-    parser.add_argument(
-        "--credit", default="", metavar="TEXT", help="added to the credits: whose the scenarios are"
-    )
-    parser.add_argument(
-        "--license",
-        default="CC0-1.0",
-        metavar="SPDX",
-        help="of the recordings, which hold the scenarios' lanes (default CC0-1.0)",
-    )
-    parser.add_argument("--jobs", type=_count_of(1), default=1, help="processes (default 1)")
 
 
 def run(args: argparse.Namespace) -> int:
