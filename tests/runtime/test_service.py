@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import signal
 import threading
 import time
 from collections import deque
@@ -205,6 +206,28 @@ def test_a_bus_that_fails_is_not_taken_for_a_silent_one(radar: Pipeline) -> None
         with pytest.raises(BusError, match="can no longer be read"):
             Service(radar, merged, [], print).run(lambda: False)
     close(buses.values())
+
+
+def test_a_signal_does_not_make_the_wait_for_messages_endless() -> None:
+    """Timers fire while it waits; whenever that is, it must come back after its 2 ms."""
+    names = [next(CHANNELS), next(CHANNELS)]
+    buses = {name: open_bus(name, "virtual") for name in names}
+    other = open_bus(names[0], "virtual")
+    fired = []
+    before = signal.signal(signal.SIGALRM, lambda *_: fired.append(time.monotonic()))
+    with Merged(buses) as merged:
+        signal.setitimer(signal.ITIMER_REAL, 0.0007, 0.0007)
+        rescue = threading.Timer(20.0, other.send, [can.Message()])  # fails instead of hanging
+        rescue.start()
+        try:
+            for _ in range(500):
+                assert merged.recv(0.002) is None
+        finally:
+            rescue.cancel()
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, before)
+    assert len(fired) > 500
+    close([*buses.values(), other])
 
 
 def close(buses: Iterable[can.BusABC]) -> None:

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty, Queue
 
 import can
 
@@ -183,7 +183,8 @@ class Merged:
     """Several buses read as one, each by a thread of python-can's."""
 
     def __init__(self, buses: Mapping[str, can.BusABC]) -> None:
-        self._heard: SimpleQueue[can.Message | Exception] = SimpleQueue()
+        # Not SimpleQueue: up to Python 3.12, a signal late in its wait makes the wait endless.
+        self._heard: Queue[can.Message | Exception] = Queue()
         self._notifiers = [
             can.Notifier(bus, [_Ear(channel, self._heard)], timeout=_NOTICE_END_S)
             for channel, bus in buses.items()
@@ -213,7 +214,7 @@ class Merged:
 class _Ear(can.Listener):
     """Puts what a bus's thread hears where the main thread reads."""
 
-    def __init__(self, channel: str, heard: SimpleQueue[can.Message | Exception]) -> None:
+    def __init__(self, channel: str, heard: Queue[can.Message | Exception]) -> None:
         self._channel = channel
         self._heard = heard
 
