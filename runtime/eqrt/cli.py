@@ -28,6 +28,7 @@ COMMANDS = {
     "prepare": ("eqrt.export.prepare", "cut recordings into training windows (extra: train)"),
     "simulate": ("eqrt.training.simulation.command", "record traffic driven by SUMO (extra: sim)"),
     "train": ("eqrt.training.train", "train a predictor (extra: train)"),
+    "compare": ("eqrt.training.compare", "trainings side by side: a table, a curve (extra: train)"),
     "eval": (
         "eqrt.export.evaluation.command",
         "measure a model on recorded traffic (extra: train)",

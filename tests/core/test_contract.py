@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -21,6 +22,7 @@ CONTRACT = ModelContract(
     num_modes=6,
     dt_s=0.1,
 )
+UNCERTAIN = replace(CONTRACT, covariances=True)
 SIZES = (
     "num_agents",
     "history_steps",
@@ -72,8 +74,30 @@ def test_the_tensors_are_those_of_version_one() -> None:
     ]
 
 
+def test_a_model_that_knows_its_errors_has_a_third_output() -> None:
+    assert list(UNCERTAIN.outputs.items()) == [
+        *CONTRACT.outputs.items(),
+        ("covariances", ("float32", ("B", 6, 30, 2, 2))),
+    ]
+    values = json.loads(UNCERTAIN.to_json())
+    assert values["covariances"] is True
+    assert values["units"]["covariance"] == "m^2"
+    assert ModelContract.from_json(UNCERTAIN.to_json(), "model.onnx") == UNCERTAIN
+
+
+def test_a_contract_from_before_covariances_has_none() -> None:
+    values = json.loads(CONTRACT.to_json())
+    del values["covariances"]
+    assert ModelContract.from_json(json.dumps(values), "model.onnx") == CONTRACT
+
+
+@pytest.mark.parametrize("value", [0, 1, "true", None, []])
+def test_covariances_are_there_or_not(value: object) -> None:
+    assert "covariances" in refused(with_field("covariances", value))
+
+
 def test_only_the_batch_axis_is_dynamic() -> None:
-    for _, shape in (*CONTRACT.inputs.values(), *CONTRACT.outputs.values()):
+    for _, shape in (*UNCERTAIN.inputs.values(), *UNCERTAIN.outputs.values()):
         assert shape[0] == "B"
         assert all(isinstance(size, int) for size in shape[1:])
 

@@ -1,18 +1,25 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from eqrt.core.metrics import (
+    LENGTH_OF_SHARE,
     average_displacement,
     best_mode,
     brier_min_fde,
+    calibration,
     displacement,
     error_table,
     final_displacement,
+    inside,
+    log_density,
+    mahalanobis,
     min_ade,
     min_fde,
     miss_rate,
     missed,
+    surprise,
 )
 
 
@@ -88,3 +95,73 @@ def test_brier_min_fde_adds_the_squared_doubt_in_the_best_mode() -> None:
     np.testing.assert_allclose(
         brier_min_fde(TWO_TARGETS, probabilities), [2.0 + 0.25, 3.0 + 0.5625]
     )
+
+
+# --- predicted covariances
+
+LONG = 3.0 * np.diag([4.0, 1.0])
+"""The covariance of a shape S with axes of 2 m along x and 1 m along y."""
+TILTED = 3.0 * np.array([[2.0, 1.0], [1.0, 1.0]])
+"""S has the determinant 1, and the inverse [[1, -1], [-1, 2]]."""
+
+
+def test_lengths_and_densities_by_hand() -> None:
+    offset = np.array([[2.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
+    np.testing.assert_allclose(mahalanobis(offset, LONG), [1.0, 2.0, 0.0])
+    np.testing.assert_allclose(mahalanobis(offset, TILTED), [2.0, np.sqrt(8.0), 0.0])
+    np.testing.assert_allclose(
+        np.exp(log_density(offset, LONG)), np.exp([-1.0, -2.0, 0.0]) / (4 * np.pi)
+    )
+
+
+def test_the_density_sums_to_one_and_has_the_covariance_that_was_predicted() -> None:
+    """On a grid of 0.1 m, as far as it matters."""
+    side = np.arange(-40.0, 40.0, 0.1)
+    grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1)
+    mass = np.exp(log_density(grid, TILTED)) * 0.1**2
+    assert mass.sum() == pytest.approx(1.0, abs=1e-3)
+    spread = np.einsum("xy,xyi,xyj->ij", mass, grid, grid)
+    np.testing.assert_allclose(spread, TILTED, atol=0.02)
+    for percent in LENGTH_OF_SHARE:
+        held = mass[inside(grid, TILTED, percent)].sum()
+        assert held == pytest.approx(percent / 100, abs=2e-3)
+
+
+def test_an_ellipses_size_holds_its_share() -> None:
+    for percent, length in LENGTH_OF_SHARE.items():
+        assert 1.0 - (1.0 + length) * np.exp(-length) == pytest.approx(percent / 100, abs=1e-9)
+
+
+def test_surprise_is_that_of_all_modes_together() -> None:
+    """Twice the same mode says what one says; a mode that nobody believes in says nothing."""
+    offset = np.array([[[2.0, 0.0], [2.0, 0.0]]])
+    covariances = np.stack([LONG, LONG])[None]
+    alone = 1.0 + np.log(4 * np.pi)
+    for probabilities in ([[0.5, 0.5]], [[0.9, 0.1]]):
+        found = surprise(offset, covariances, np.array(probabilities))
+        np.testing.assert_allclose(found, [alone])
+    far = np.array([[[2.0, 0.0], [900.0, 0.0]]])
+    np.testing.assert_allclose(
+        surprise(far, covariances, np.array([[0.5, 0.5]])), alone + np.log(2)
+    )
+    unlikely = surprise(far[:, ::-1], covariances, np.array([[1.0, 0.0]]))
+    assert np.isfinite(unlikely).all()
+    assert unlikely[0] > 20.0
+
+
+def test_the_ellipse_is_the_best_modes_at_the_end() -> None:
+    """The second mode ends 1.7 m (m = 1.7) from the truth: within 90 %, outside 50 % (1.678)."""
+    truth = np.zeros((2, 3, 2))
+    modes = np.full((2, 2, 3, 2), 50.0)
+    modes[:, 1, -1] = [[0.0, 1.7], [0.0, 1.6]]
+    covariances = np.broadcast_to(np.stack([1e6 * np.eye(2), LONG]), (2, 2, 2, 2))
+    table = calibration(modes, np.array([[0.0, 1.0]] * 2), covariances, truth)
+    np.testing.assert_array_equal(table["inside_50"], [0.0, 1.0])
+    np.testing.assert_array_equal(table["inside_90"], [1.0, 1.0])
+    np.testing.assert_allclose(table["nll"], np.array([1.7, 1.6]) + np.log(4 * np.pi), atol=1e-6)
+
+
+def test_a_covariance_without_area_is_bad_but_a_number() -> None:
+    flat = np.diag([1.0, 0.0])[None]
+    assert np.isfinite(log_density(np.ones((1, 2)), flat)).all()
+    assert not inside(np.ones((1, 2)), flat, 90)[0]

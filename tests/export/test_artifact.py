@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -18,13 +19,14 @@ import torch
 from eqrt.core.contract import METADATA_KEY, ModelContract
 from eqrt.core.errors import ContractError, EqrtError
 from eqrt.core.scene import Scene, concatenate
-from eqrt.export.artifact import write_artifact
+from eqrt.export.artifact import reference, write_artifact
 from eqrt.export.to_onnx import FORBIDDEN_OPS, IR_VERSION, OPSET, to_onnx
 from eqrt.export.vectors import move, named_scenes, nan_where_invalid
-from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor, disagreement
 from eqrt.training.checkpoint import Card
 from eqrt.training.networks.compact import CompactConfig, CompactPredictor
 from eqrt.training.networks.config import SceneConfig
+from eqrt.training.networks.registry import ModelConfig
 from poses import random_pose
 
 SCENE = SceneConfig(
@@ -83,6 +85,30 @@ def shipped() -> Predictor:
 
 
 SHIPPED_SCENES = named_scenes(Predictor.load(DEFAULT_ARTIFACT).contract)
+
+
+def uncertain_model(modes: int) -> tuple[CompactPredictor, ModelContract]:
+    torch.manual_seed(6)
+    config = ModelConfig(
+        scene=replace(SCENE, num_modes=modes),
+        kind="compact",
+        network=replace(NETWORK, uncertainty=True),
+    )
+    model = CompactPredictor(config.scene, config.network).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return model, config.contract("uncertain", "1.0.0")
+
+
+@pytest.fixture(scope="module")
+def uncertain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An artifact of six modes with covariances."""
+    folder = tmp_path_factory.mktemp("export") / "uncertain"
+    model, contract = uncertain_model(6)
+    card = replace(CARD, metrics={"ade_3s": 1.0, "nll": 2.5, "inside_50": 0.5, "inside_90": 0.9})
+    assert write_artifact(model, contract, card, folder) < 1e-3
+    return folder
 
 
 def nan_free(scene: Scene) -> Scene:
@@ -190,6 +216,93 @@ def stored(vector: Path, side: str, count: int) -> list[np.ndarray]:
     """The tensors of one side of a test vector, in order."""
     paths = [vector / f"{side}_{index}.pb" for index in range(count)]
     return [onnx.numpy_helper.to_array(onnx.load_tensor(path)) for path in paths]
+
+
+def test_covariances_are_the_third_output_of_an_artifact_that_has_them(
+    uncertain: Path, shipped: Predictor
+) -> None:
+    predictor = Predictor.load(uncertain)
+    model, contract = uncertain_model(6)
+    assert predictor.contract == contract
+    assert contract.covariances
+    scene = named_scenes(contract)["driving"]
+    found = predictor.predict(replace(scene, origin=np.array([4e6, -3e6])))
+    assert found.covariances is not None
+    assert found.covariances.dtype == np.float64
+    expected = reference(model, scene)[2].astype(np.float64)
+    assert disagreement("covariances", found.covariances, expected) < 1e-4
+    assert shipped.predict(SHIPPED_SCENES["driving"]).covariances is None
+
+
+def test_one_uncertain_mode_is_exported_like_six(tmp_path: Path) -> None:
+    model, contract = uncertain_model(1)
+    assert write_artifact(model, contract, CARD, tmp_path / "one") < 1e-3
+    scene = concatenate(list(named_scenes(contract).values()))
+    covariances = Predictor.load(tmp_path / "one").predict(scene).covariances
+    assert covariances is not None
+    assert covariances.shape == (len(scene.history), 1, 30, 2, 2)
+
+
+def test_covariances_of_the_file_turn_with_the_world(uncertain: Path) -> None:
+    predictor, rng = Predictor.load(uncertain), np.random.default_rng(12)
+    for scene in named_scenes(predictor.contract).values():
+        before = predictor.predict(nan_free(scene)).covariances
+        pose = random_pose(rng, 250.0)
+        after = predictor.predict(move(nan_free(scene), pose)).covariances
+        assert before is not None
+        assert after is not None
+        turn = pose.rotate(np.eye(2)).T  # its columns are where x and y go
+        assert disagreement("covariances", after, turn @ before @ turn.T) < 1e-2
+
+
+def test_the_reference_evaluator_computes_the_same_covariances(uncertain: Path) -> None:
+    from onnx.reference import ReferenceEvaluator
+
+    contract = uncertain_model(6)[1]
+    evaluator = ReferenceEvaluator(onnx.load(uncertain / "model.onnx"))
+    folder = uncertain / "test_data_set_0"
+    feed = dict(zip(contract.inputs, stored(folder, "input", 5), strict=True))
+    found = list(evaluator.run(None, feed))
+    assert disagreement("covariances", found[2], stored(folder, "output", 3)[2]) < 1e-3
+
+
+def test_covariances_that_come_out_differently_are_refused(uncertain: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(uncertain, tmp_path / "copy"))
+    path = copy / "test_data_set_0" / "output_2.pb"
+    tensor = onnx.load_tensor(path)
+    values = 1.01 * onnx.numpy_helper.to_array(tensor)
+    path.write_bytes(onnx.numpy_helper.from_array(values, tensor.name).SerializeToString())
+    with pytest.raises(ContractError, match=r"the model's covariances differ by 0\.0"):
+        Predictor.load(copy)
+
+
+def test_the_model_card_says_how_well_the_model_knows_its_errors(uncertain: Path) -> None:
+    """Constant velocity does not say it, so its column stays empty."""
+    card = (uncertain / "README.md").read_text(encoding="utf-8")
+    assert "| NLL, nats | 2.500 |  |" in card
+    assert "| truth inside the 90 % ellipse, share | 0.900 |  |" in card
+    assert "| `covariances` | float32 | (B, 6, 30, 2, 2) |" in card
+
+
+def test_the_model_card_says_whether_the_model_is_equivariant(
+    artifact: Path, tmp_path: Path
+) -> None:
+    promise = "shifting that frame turns or shifts the prediction and nothing else"
+    assert promise in (artifact / "README.md").read_text(encoding="utf-8")
+    torch.manual_seed(5)
+    upright = CompactPredictor(SCENE, replace(NETWORK, frame="translated")).eval()
+    write_artifact(upright, SCENE.contract("upright", "1.0.0"), CARD, tmp_path / "upright")
+    card = (tmp_path / "upright" / "README.md").read_text(encoding="utf-8")
+    assert promise not in card
+    assert re.search(r"the model is not equivariant: .* predicts up to \d", card)
+
+
+def test_a_network_with_other_outputs_than_its_contract_is_not_exported(tmp_path: Path) -> None:
+    model, contract = uncertain_model(1)
+    certain = replace(contract, covariances=False)
+    with pytest.raises(ValueError, match="the network has 3 outputs, the contract has trajec"):
+        write_artifact(model, certain, CARD, tmp_path / "none")
+    assert not list(tmp_path.iterdir())
 
 
 def flip_a_bit(folder: Path) -> None:

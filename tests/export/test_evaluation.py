@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from eqrt.cli import main
 from eqrt.core.errors import EqrtError
+from eqrt.export.artifact import write_artifact
 from eqrt.export.evaluation.manoeuvres import MANOEUVRES, SPEED_BANDS
 from eqrt.export.evaluation.measure import Piece, Settings, measure
 from eqrt.export.evaluation.predictors import load_model
@@ -32,6 +32,7 @@ from eqrt.export.evaluation.tally import (
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.training.checkpoint import Card, save_checkpoint
 from eqrt.training.dataset.windows import Windows
+from eqrt.training.evaluate import Predicted
 from eqrt.training.networks.compact import CompactConfig
 from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.registry import ModelConfig, build_network
@@ -109,7 +110,7 @@ def test_errors_of_eight_modes_by_hand() -> None:
     truth = np.zeros((1, 30, 2))
     modes = np.zeros((1, 8, 30, 2))
     modes[0, :, :, 1] = np.arange(8.0, 0.0, -1.0)[:, None]
-    table = errors_of(modes, np.full((1, 8), 0.125), truth, dt_s=0.1)
+    table = errors_of(Predicted(modes, np.full((1, 8), 0.125)), truth, dt_s=0.1)
     expected = {
         **dict.fromkeys(("ade_1s", "fde_1s", "ade_2s", "fde_2s", "ade_3s", "fde_3s"), 8.0),
         "miss_rate": 1.0,
@@ -273,15 +274,53 @@ def test_a_checkpoint_of_eight_modes(packed: Path, tmp_path: Path, checkpoint: P
     assert folder["groups"] == report["groups"]
 
 
+def test_calibration_by_hand() -> None:
+    """Two targets, 1 m and 9 m off at the end; S = 1 m^2 in all directions: m = 1 and 9."""
+    truth = np.zeros((2, 30, 2))
+    modes = np.zeros((2, 1, 30, 2))
+    modes[:, 0, -1, 1] = [1.0, 9.0]
+    spread = np.broadcast_to(3.0 * np.eye(2), (2, 1, 2, 2))
+    table = errors_of(Predicted(modes, np.ones((2, 1)), spread), truth, dt_s=0.1)
+    np.testing.assert_allclose(table["nll"], np.array([1.0, 9.0]) + np.log(2 * np.pi))
+    np.testing.assert_array_equal(table["inside_50"], [1.0, 0.0])
+    np.testing.assert_array_equal(table["inside_90"], [1.0, 0.0])
+
+
+def test_a_model_that_says_how_far_off_it_may_be_is_measured_by_it(
+    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The checkpoint and the artifact alike; the baselines say nothing of the kind."""
+    torch.manual_seed(3)
+    network = replace(NETWORK, uncertainty=True)
+    config = ModelConfig(scene=SCENE, kind="compact", network=network)
+    model = build_network(config)
+    save_checkpoint(tmp_path / "run" / "model.safetensors", model, config, CARD)
+    write_artifact(model, config.contract("uncertain", "1.0.0"), CARD, tmp_path / "artifact")
+    reports = [
+        evaluate(tmp_path, "--data", packed, model=tmp_path / name) for name in ("run", "artifact")
+    ]
+    tables = [errors(report, "model") for report in reports]
+    assert {"nll", "inside_50", "inside_90"} < tables[0].keys()
+    assert tables[0] == pytest.approx(tables[1], abs=1e-3)
+    for report in reports:
+        assert report["model"]["covariances"] is True
+        assert "nll" not in errors(report, "constant velocity")
+        assert "nll" not in errors(report, "published")
+    lines = capsys.readouterr().out.splitlines()
+    (said,) = {line for line in lines if line.startswith("uncertainty, 3 s")}
+    assert f"NLL {tables[0]['nll']:.3f} nats" in said
+    assert max(len(line) for line in lines if not line.startswith(" ")) <= 100
+
+
 def test_what_no_vehicle_can_do_is_counted_and_measured_as_the_service_publishes_it(
     packed: Path,
 ) -> None:
     """A model that jumps by 50 m: refused every time, and constant turn rate stands in for it."""
     sound = load_model(DEFAULT_ARTIFACT)
 
-    def jump(windows: Windows) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        trajectories, probabilities = sound.predict(windows)
-        return trajectories + 50.0, probabilities
+    def jump(windows: Windows) -> Predicted:
+        predicted = sound.predict(windows)
+        return replace(predicted, trajectories=predicted.trajectories + 50.0)
 
     piece = Piece(model=DEFAULT_ARTIFACT, data=packed, base=Path.cwd(), settings=SETTINGS)
     selection = select(packed, sound.contract, SETTINGS.choice)
@@ -300,14 +339,18 @@ def test_what_no_vehicle_can_do_is_counted_and_measured_as_the_service_publishes
 def test_a_model_that_predicts_no_numbers_is_refused(packed: Path) -> None:
     sound = load_model(DEFAULT_ARTIFACT)
 
-    def nothing(windows: Windows) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        trajectories, probabilities = sound.predict(windows)
-        return trajectories * np.nan, probabilities
+    def nothing(windows: Windows) -> Predicted:
+        predicted = sound.predict(windows)
+        return replace(predicted, trajectories=predicted.trajectories * np.nan)
+
+    def no_spread(windows: Windows) -> Predicted:
+        return replace(sound.predict(windows), end_covariances=np.full((1, 1, 2, 2), np.inf))
 
     piece = Piece(model=DEFAULT_ARTIFACT, data=packed, base=Path.cwd(), settings=SETTINGS)
     selection = select(packed, sound.contract, SETTINGS.choice)
-    with pytest.raises(EqrtError, match="predicts what is not a number"):
-        measure(replace(sound, predict=nothing), selection, piece)
+    for broken in (nothing, no_spread):
+        with pytest.raises(EqrtError, match="predicts what is not a number"):
+            measure(replace(sound, predict=broken), selection, piece)
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: object) -> list[str]:

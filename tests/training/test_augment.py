@@ -9,26 +9,6 @@ from eqrt.training.augment import AugmentConfig, augment
 from eqrt.training.dataset.windows import Windows
 from window_samples import ROOMY, scenario_windows
 
-NOTHING = AugmentConfig(
-    mirrored=0.0,
-    scaled=0.0,
-    max_scale=1.0,
-    parked=0.0,
-    standing=0.0,
-    clutter=0.0,
-    ghost=0.0,
-    alone=0.0,
-    short_history=0.0,
-    missing_step=0.0,
-    hidden_neighbour=0.0,
-    missing_line=0.0,
-    line_offset_m=0.0,
-    no_map=0.0,
-    unknown_heading=0.0,
-    heading_noise_rad=0.0,
-    position_noise_m=0.0,
-)
-
 
 @pytest.fixture(scope="module")
 def windows() -> Windows:
@@ -36,9 +16,8 @@ def windows() -> Windows:
 
 
 def augmented(windows: Windows, **changes: float) -> dict[str, torch.Tensor]:
-    fields = {name: getattr(NOTHING, name) for name in AugmentConfig.__dataclass_fields__}
     generator = torch.Generator().manual_seed(0)
-    return augment(windows.tensors(), AugmentConfig(**(fields | changes)), generator)
+    return augment(windows.tensors(), AugmentConfig(**changes), generator)
 
 
 def test_without_augmentation_a_batch_stays_as_it_is(windows: Windows) -> None:
@@ -130,6 +109,34 @@ def test_a_mirrored_scene_turns_left_into_right_and_keeps_every_distance(windows
         torch.testing.assert_close(new, old, atol=1e-3, rtol=1e-4)
     torch.testing.assert_close(batch["heading"][:, 0], before["heading"][:, 0])
     torch.testing.assert_close(batch["heading"][:, 1], -before["heading"][:, 1])
+
+
+def test_a_rotated_scene_keeps_every_distance_and_turns_heading_and_path_alike(
+    windows: Windows,
+) -> None:
+    batch, before = augmented(windows, rotated=1.0), windows.tensors()
+    here = before["history"][:, 0, -1]
+    torch.testing.assert_close(batch["history"][:, 0, -1], here)
+
+    def seen_from_target(values: dict[str, torch.Tensor], name: str) -> torch.Tensor:
+        return torch.view_as_complex(values[name].flatten(1, -2) - here.unsqueeze(1))
+
+    heading = torch.view_as_complex(batch["heading"]), torch.view_as_complex(before["heading"])
+    known = heading[1].abs() > 0.5
+    turn = (heading[0] / heading[1])[:, None]  # of each window
+    for name in ("history", "centerlines", "future"):
+        old, new = seen_from_target(before, name), seen_from_target(batch, name)
+        torch.testing.assert_close(new.abs(), old.abs(), atol=1e-3, rtol=1e-4)
+        expected = (turn * old)[known]
+        assert expected.abs().max() > 10.0
+        torch.testing.assert_close(new[known], expected, atol=2e-2, rtol=1e-3)
+    assert turn[known].angle().std() > 0.5  # by all kinds of angles
+
+
+def test_only_the_share_asked_for_is_rotated(windows: Windows) -> None:
+    batch, before = augmented(windows, rotated=0.5), windows.tensors()
+    moved = (batch["history"] - before["history"]).abs().amax(dim=(1, 2, 3)) > 0.1
+    assert 0.2 < moved.float().mean() < 0.8
 
 
 def test_an_inexact_map_shifts_each_line_as_a_whole(windows: Windows) -> None:

@@ -21,10 +21,12 @@ from eqrt.export.vectors import (
     without_map,
     without_neighbours,
 )
-from eqrt.training.losses import best_mode_loss
+from eqrt.training.losses import best_mode_loss, spread_loss
 from eqrt.training.networks.canonical import canonical_from_tile
 from eqrt.training.networks.compact import CompactConfig, CompactPredictor
 from eqrt.training.networks.config import SceneConfig
+from eqrt.training.networks.registry import ModelConfig
+from eqrt.training.networks.spread import FLOOR_M, START_M, START_MPS
 from poses import random_pose
 
 SCENE = SceneConfig(
@@ -43,24 +45,45 @@ SCENES = named_scenes(CONTRACT)
 SOMEWHERE = Pose2(5.0, 5.0, 0.3)
 
 
-@pytest.fixture(scope="module")
-def model() -> CompactPredictor:
+VARIANTS = {
+    "one step": replace(CONFIG, heading="one_step"),
+    "points": replace(CONFIG, tokens="point"),
+    "uncertain": replace(CONFIG, uncertainty=True),
+    "translated": replace(CONFIG, frame="translated"),
+}
+
+
+def random_network(config: CompactConfig) -> CompactPredictor:
     """Random weights everywhere, also where training starts from zero."""
     torch.manual_seed(7)
-    model = CompactPredictor(SCENE, CONFIG).double().eval()
+    model = CompactPredictor(SCENE, config).double().eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     return model
 
 
+@pytest.fixture(scope="module")
+def model() -> CompactPredictor:
+    return random_network(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def variants() -> dict[str, CompactPredictor]:
+    return {name: random_network(config) for name, config in VARIANTS.items()}
+
+
 def predict(model: CompactPredictor, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    trajectories, probabilities, *_ = outputs(model, scene)
+    return trajectories, probabilities
+
+
+def outputs(model: CompactPredictor, scene: Scene) -> list[np.ndarray]:
+    """All there are, in the contract's order."""
     inputs = [torch.from_numpy(value) for value in scene.inputs().values()]
     with torch.no_grad():
-        trajectories, probabilities = model(
-            *(value.double() if value.is_floating_point() else value for value in inputs)
-        )
-    return trajectories.numpy(), probabilities.numpy()
+        found = model(*(value.double() if value.is_floating_point() else value for value in inputs))
+    return [output.numpy() for output in found]
 
 
 def in_double(scene: Scene) -> Scene:
@@ -248,3 +271,188 @@ def test_in_bfloat16_the_prediction_moves_by_its_features_not_by_its_positions()
             rounded, _ = model(*inputs)
     assert rounded.dtype == torch.float32
     assert 0.0 < float((rounded - expected).abs().max()) < 0.1
+
+
+# --- what else it may be: each choice against the other
+
+
+@pytest.mark.parametrize("scene_name", SCENES)
+@pytest.mark.parametrize("variant", ["one step", "points", "uncertain"])
+def test_variants_that_turn_are_equivariant_and_so_are_covariances(
+    variants: dict[str, CompactPredictor], variant: str, scene_name: str
+) -> None:
+    rng = np.random.default_rng(5)
+    scene = in_double(nan_free(SCENES[scene_name]))
+    before, probabilities, *covariances = outputs(variants[variant], scene)
+    for _ in range(4):
+        pose = random_pose(rng, 900.0)
+        after, same, *turned = outputs(variants[variant], move_exactly(scene, pose))
+        np.testing.assert_allclose(after, pose.apply(before), atol=1e-8)
+        np.testing.assert_allclose(same, probabilities, atol=1e-10)
+        turn = pose.rotate(np.eye(2)).T  # its columns are where x and y go
+        for expected, found in zip(covariances, turned, strict=True):
+            np.testing.assert_allclose(found, turn @ expected @ turn.T, atol=1e-8)
+
+
+def test_a_network_that_only_translates_is_shifted_but_not_turned(
+    variants: dict[str, CompactPredictor],
+) -> None:
+    model, scene = variants["translated"], in_double(SCENES["driving"])
+    before, _ = predict(model, scene)
+    shift, turn = Pose2(-80.0, 35.0, 0.0), Pose2(0.0, 0.0, 1.0)
+    after, _ = predict(model, move_exactly(scene, shift))
+    np.testing.assert_allclose(after, shift.apply(before), atol=1e-8)
+    after, _ = predict(model, move_exactly(scene, turn))
+    assert np.abs(after - turn.apply(before)).max() > 0.1
+
+
+def test_the_last_step_tells_the_heading_of_the_last_second_only_on_a_straight_course(
+    model: CompactPredictor, variants: dict[str, CompactPredictor]
+) -> None:
+    """The two networks have the same weights, so that only the frame can differ."""
+    bend = in_double(without_map(SCENES["driving"]))
+    straight = replace(bend, history=bend.history * np.array([1.0, 0.0]))
+    same, _ = predict(variants["one step"], straight)
+    np.testing.assert_allclose(same, predict(model, straight)[0], atol=1e-5)
+    other, _ = predict(variants["one step"], bend)
+    assert np.abs(other - predict(model, bend)[0]).max() > 0.01
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_no_variant_reads_values_under_false_masks(
+    variants: dict[str, CompactPredictor], variant: str, name: str
+) -> None:
+    clean = outputs(variants[variant], nan_free(SCENES[name]))
+    dirty = outputs(variants[variant], nan_where_invalid(SCENES[name]))
+    for one, other in zip(clean, dirty, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_points_of_a_line_may_come_in_any_place_but_say_which_way_it_leads(
+    variants: dict[str, CompactPredictor],
+) -> None:
+    """Swapping whole lines changes nothing; driving them the other way does."""
+    model, scene = variants["points"], SCENES["driving"]
+    swapped = replace(
+        scene,
+        centerlines=scene.centerlines[:, ::-1].copy(),
+        centerlines_valid=scene.centerlines_valid[:, ::-1].copy(),
+    )
+    before, _ = predict(model, scene)
+    np.testing.assert_allclose(predict(model, swapped)[0], before, atol=1e-10)
+    against = replace(
+        scene,
+        centerlines=scene.centerlines[:, :, ::-1].copy(),
+        centerlines_valid=scene.centerlines_valid[:, :, ::-1].copy(),
+    )
+    assert np.abs(predict(model, against)[0] - before).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ({"heading": "north"}, "heading is 'north', expected one of one_step, robust"),
+        ({"frame": "map"}, "frame is 'map', expected one of translated, rotated"),
+        ({"tokens": "pixel"}, "tokens is 'pixel', expected one of line, point"),
+        ({"uncertainty": "no"}, "uncertainty is 'no', expected true or false"),
+    ],
+)
+def test_a_choice_that_there_is_not_is_named(setting: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        replace(CONFIG, **setting)
+
+
+def test_a_configuration_from_before_the_choices_means_what_it_meant() -> None:
+    tables = ModelConfig(scene=SCENE, kind="compact", network=CONFIG).to_tables()
+    old = {name: tables["network"][name] for name in ("kind", "width", "heads", "layers")}
+    old |= {"decoder_layers": 2, "dropout": 0.1}
+    assert set(tables["network"]) - set(old) == {"heading", "frame", "tokens", "uncertainty"}
+    assert ModelConfig.from_tables(tables["scene"], old).network == CONFIG
+    del old["width"]
+    with pytest.raises(ValueError, match=r"\[network\] has missing or unknown fields: width"):
+        ModelConfig.from_tables(tables["scene"], old)
+
+
+def test_the_contract_has_a_third_output_if_the_network_has() -> None:
+    certain = ModelConfig(scene=SCENE, kind="compact", network=CONFIG).contract("test", "0.0.0")
+    assert certain == CONTRACT
+    uncertain = ModelConfig(scene=SCENE, kind="compact", network=VARIANTS["uncertain"])
+    assert uncertain.contract("test", "0.0.0") == replace(CONTRACT, covariances=True)
+
+
+# --- predicted uncertainty
+
+
+def test_fresh_weights_predict_the_same_with_and_without_uncertainty() -> None:
+    networks = []
+    for config in (CONFIG, VARIANTS["uncertain"]):
+        torch.manual_seed(4)
+        networks.append(CompactPredictor(SCENE, config).double().eval())
+    for scene in SCENES.values():
+        for one, other in zip(*(predict(network, scene) for network in networks), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_covariances_are_symmetric_and_nowhere_below_the_floor(
+    variants: dict[str, CompactPredictor], name: str
+) -> None:
+    *_, covariances = outputs(variants["uncertain"], SCENES[name])
+    assert covariances.shape == (1, SCENE.num_modes, SCENE.horizon_steps, 2, 2)
+    np.testing.assert_array_equal(covariances, covariances.swapaxes(-1, -2))
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
+    assert np.linalg.det(covariances).min() > (3 * FLOOR_M**2) ** 2
+
+
+def test_training_starts_from_a_spread_that_grows_with_time() -> None:
+    """0.15 m after a step and 1.6 m after three seconds, within half as much again."""
+    torch.manual_seed(4)
+    model = CompactPredictor(SCENE, VARIANTS["uncertain"]).double().eval()
+    *_, covariances = outputs(model, SCENES["driving"])
+    scale = np.linalg.det(covariances[0] / 3) ** 0.25  # (K, H) metres
+    for step in (0, 9, 29):
+        expected = START_M + START_MPS * 0.1 * (step + 1)
+        assert (scale[:, step] > expected / 1.5).all()
+        assert (scale[:, step] < expected * 1.5).all()
+
+
+def test_the_spread_of_a_target_without_any_direction_is_a_circle(
+    variants: dict[str, CompactPredictor],
+) -> None:
+    *_, covariances = outputs(variants["uncertain"], SCENES["lone_agent_no_map_stopped"])
+    np.testing.assert_allclose(covariances[..., 0, 1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(covariances[..., 0, 0], covariances[..., 1, 1])
+    assert covariances[..., 0, 0].min() > FLOOR_M**2
+
+
+def test_covariances_come_in_the_order_of_their_modes(
+    variants: dict[str, CompactPredictor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without probabilities that differ, modes stay as they are drawn: the same pairs are there."""
+    model, scene = variants["uncertain"], SCENES["driving"]
+    sorted_modes = outputs(model, scene)
+    with torch.no_grad():
+        last = list(model.modes.logit.parameters())[-2]
+        monkeypatch.setattr(last, "data", -last.data)  # the least probable first
+    turned_over = outputs(model, scene)
+    for ahead, behind in zip(sorted_modes[::2], turned_over[::2], strict=True):
+        np.testing.assert_allclose(ahead, behind[:, ::-1], atol=1e-10)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 20])
+def test_gradients_of_the_spread_are_finite_whatever_is_masked(steps: int) -> None:
+    torch.manual_seed(1)
+    model = CompactPredictor(SCENE, VARIANTS["uncertain"])
+    future = torch.zeros(1, SCENE.horizon_steps, 2)
+    for name, seen_until in (("stopped", 30), ("lone_agent_no_map_stopped", 7), ("driving", 0)):
+        model.zero_grad()
+        scene = seen_for(SCENES[name], steps)
+        inputs = [torch.from_numpy(value) for value in scene.inputs().values()]
+        trajectories, _, covariances = model(*inputs)
+        seen = (torch.arange(SCENE.horizon_steps) < seen_until)[None]
+        spread_loss(trajectories, covariances, future, seen).backward()  # type: ignore[no-untyped-call]
+        assert model.modes.spread is not None
+        gradients = [p.grad for p in model.modes.spread.parameters() if p.grad is not None]
+        assert gradients
+        assert all(torch.isfinite(gradient).all() for gradient in gradients)

@@ -13,7 +13,7 @@ from eqrt.training.dataset.windows import WindowOptions
 from source_tree import ROOT
 from tiny_training import AUGMENT, tiny, tiny_file
 
-CONFIGS = sorted((ROOT / "training/configs").glob("*.toml"))
+CONFIGS = sorted((ROOT / "training/configs").rglob("*.toml"))
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,13 @@ from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.eqmotion import EqMotion, EqMotionConfig
 from eqrt.training.networks.eqmotion_layers import Agents, channel_distances
 from eqrt.training.networks.lstm import LstmBaseline, LstmConfig
-from eqrt.training.networks.map_tokens import AttentionEncoder, attend
+from eqrt.training.networks.map_tokens import (
+    AttentionEncoder,
+    TransformerEncoder,
+    attend,
+    choose,
+    read_side_by_side,
+)
 from eqrt.training.networks.target_frame import TargetFrame, fitted_velocity, last_step
 from paper_systems import (
     EQMOTION,
@@ -309,6 +317,55 @@ def test_a_map_without_a_valid_point_has_the_feature_of_no_map() -> None:
     feature = encoder(torch.randn(2, 6, 2), nothing)
     torch.testing.assert_close(feature[0], feature[1])
     torch.testing.assert_close(feature[0], encoder.perceptron(torch.zeros(24)))
+
+
+ENCODERS: dict[str, Callable[[float], nn.Module]] = {
+    "attention": lambda dropout: AttentionEncoder(8, 4, [8, 8], dropout),
+    "transformer": lambda dropout: TransformerEncoder(8, 4, 2, [8, 8], dropout),
+}
+"""Over eight points."""
+
+
+def encoded(kind: str, dropout: float, training: bool) -> tuple[Tensor, nn.Module]:
+    torch.manual_seed(4)
+    encoder = ENCODERS[kind](dropout).train(training)
+    points, valid = torch.randn(3, 8, 2), torch.ones(3, 8, dtype=torch.bool)
+    valid[0, 5:] = False
+    torch.manual_seed(9)
+    feature: Tensor = encoder(points, valid)
+    return feature, encoder
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_no_point_is_dropped_when_the_training_is_over(kind: str) -> None:
+    assert torch.equal(encoded(kind, 0.5, training=False)[0], encoded(kind, 0.0, False)[0])
+    torch.testing.assert_close(encoded(kind, 1e-9, True)[0], encoded(kind, 0.0, True)[0])
+    assert not torch.equal(encoded(kind, 0.5, True)[0], encoded(kind, 0.0, True)[0])
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_a_training_step_learns_from_the_points_that_it_reads_and_no_others(kind: str) -> None:
+    feature, encoder = encoded(kind, 0.75, training=True)
+    first = encoder.get_parameter("perceptron.0.weight")
+    (gradient,) = torch.autograd.grad(feature.sum(), first)
+    read = gradient.view(-1, 8, 4).abs().amax(dim=(0, 2)) > 0
+    torch.manual_seed(9)
+    chosen = choose(8, 0.75)
+    assert chosen is not None
+    assert set(read.nonzero().flatten().tolist()) == set(chosen.tolist())
+    assert len(chosen) == 2
+
+
+def test_what_is_left_of_the_points_counts_for_more() -> None:
+    """Side by side the expected sum stays the same, over all choices."""
+    torch.manual_seed(2)
+    perceptron, tokens = nn.Sequential(nn.Linear(8, 3)), torch.randn(5, 4, 2)
+    whole = read_side_by_side(perceptron, tokens, None)
+    each = [
+        read_side_by_side(perceptron, tokens[:, chosen], chosen)
+        for chosen in (torch.tensor(pair) for pair in itertools.combinations(range(4), 2))
+    ]
+    torch.testing.assert_close(torch.stack(each).mean(0), whole)
 
 
 # -- configurations

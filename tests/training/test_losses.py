@@ -8,10 +8,13 @@ import torch
 from eqrt.training.losses import (
     FINAL_SHARE,
     LIKELIHOOD_SHARE,
+    SPREAD_SHARE,
     ade_loss,
     best_mode_loss,
     mode_displacement,
     soft_mode_loss,
+    spread_loss,
+    whole_loss,
 )
 
 FUTURE = torch.zeros(1, 4, 2)
@@ -58,3 +61,53 @@ def test_a_soft_mode_that_is_as_good_is_as_likely() -> None:
     even = soft_mode_loss(equal, torch.tensor([[0.5, 0.5]]), FUTURE, VALID)
     assert even < soft_mode_loss(equal, torch.tensor([[0.8, 0.2]]), FUTURE, VALID)
     assert even < soft_mode_loss(equal, torch.tensor([[0.2, 0.8]]), FUTURE, VALID)
+
+
+def two_spreads() -> torch.Tensor:
+    """Covariances of two_modes(): S = diag(9, 1) m^2 for the first, a huge one for the second."""
+    shape = torch.stack([torch.diag(torch.tensor([9.0, 1.0])), 1e4 * torch.eye(2)])
+    return 3.0 * shape[None, :, None].expand(1, 2, 4, 2, 2)
+
+
+def test_the_spread_is_judged_by_the_mode_that_ends_nearest_over_the_seen_steps() -> None:
+    """3 m off along an axis of 3 m: m = 1, and |S|^1/2 = 3."""
+    loss = spread_loss(two_modes(), two_spreads(), FUTURE, VALID)
+    expected = 1.0 + np.log(2 * np.pi * 3.0)
+    torch.testing.assert_close(loss, torch.tensor(float(expected)))
+
+
+def test_the_spread_that_suits_the_errors_is_best() -> None:
+    """For errors of 1 m in all directions, ln(s^2) + 1/s is least at s = 1/2."""
+    angles = torch.arange(8) * (torch.pi / 4)
+    truth = torch.stack([angles.cos(), angles.sin()], -1)[:, None]  # (8, 1, 2)
+    modes, valid = torch.zeros(8, 1, 1, 2), torch.ones(8, 1, dtype=torch.bool)
+
+    def loss(scale_m: float) -> float:
+        covariances = (3.0 * scale_m**2 * torch.eye(2)).expand(8, 1, 1, 2, 2)
+        return float(spread_loss(modes, covariances, truth, valid))
+
+    assert loss(0.5) < min(loss(0.45), loss(0.55))
+
+
+def test_trajectories_learn_nothing_from_the_spread() -> None:
+    modes = two_modes().requires_grad_()
+    spreads = two_spreads().clone().requires_grad_()
+    with_spread = whole_loss(ade_loss, [modes, torch.ones(1, 2), spreads], FUTURE, VALID)
+    with_spread.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    learned = modes.grad
+    modes.grad = None
+    alone = whole_loss(ade_loss, [modes, torch.ones(1, 2)], FUTURE, VALID)
+    alone.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    assert learned is not None
+    assert modes.grad is not None
+    torch.testing.assert_close(learned, modes.grad)
+    assert spreads.grad is not None
+    assert spreads.grad[0, 0].abs().sum() > 0.0
+    assert spreads.grad[0, 1].abs().sum() == 0.0  # not the best mode
+    share = spread_loss(two_modes(), two_spreads(), FUTURE, VALID)
+    torch.testing.assert_close(with_spread - alone, SPREAD_SHARE * share)
+
+
+def test_a_future_that_was_never_seen_says_nothing_about_the_spread() -> None:
+    unseen = torch.zeros_like(VALID)
+    assert float(spread_loss(two_modes(), two_spreads(), FUTURE, unseen)) == 0.0

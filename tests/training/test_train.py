@@ -17,6 +17,7 @@ from eqrt.training.configuration import TrainConfig, load_config
 from eqrt.training.dataset.store import open_data
 from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity, predict
 from eqrt.training.networks.registry import build_network
+from eqrt.training.recorder import MODEL_FILE
 from eqrt.training.sampling import Pool
 from eqrt.training.state import new_optimizer, new_state, update_average
 from eqrt.training.train import learning_rate, train, train_step
@@ -51,7 +52,7 @@ def test_training_beats_constant_velocity_on_what_it_saw(tmp_path: Path) -> None
     model = train(replace(SHIPPED, train=loop), data, tmp_path).average
     course = evaluate_constant_velocity(windows, scene.num_modes, scene.dt_s)
     assert evaluate(model, windows, scene.dt_s)["ade_3s"] < 0.95 * course["ade_3s"]
-    assert np.isfinite(predict(model, windows)).all()
+    assert np.isfinite(predict(model, windows).trajectories).all()
 
 
 def test_the_same_seed_trains_the_same_network_and_another_seed_another(tmp_path: Path) -> None:
@@ -140,6 +141,24 @@ def test_held_out_recordings_that_are_not_there_are_named(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_share_of_the_recordings_is_asked_for_on_the_command_line(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert main(command(tiny_file(tmp_path), out, "--steps", "1", "--train-share", "0.9")) == 0
+    card = load_checkpoint(out / MODEL_FILE).card
+    assert "--train-share 0.9" in card.command
+    assert card.config_sha256 == tiny().with_steps(1).with_train_share(0.9).sha256
+    assert card.recordings == 1
+    assert card.samples == tiny().train.batch_size
+
+
+def test_a_share_that_is_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = command(tiny_file(tmp_path), tmp_path / "out", "--train-share", "1.5")
+    assert main(words) == 2
+    assert "--train-share is 1.5, expected above 0 to 1" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--steps", "--threads", "--loader-threads"])
 def test_numbers_below_one_are_refused(tmp_path: Path, option: str) -> None:
     assert main(command(tiny_file(tmp_path), tmp_path / "out", option, "0")) == 2
@@ -186,8 +205,25 @@ def test_modes_beyond_the_first_are_measured_too(tmp_path: Path) -> None:
     assert metrics["min_fde"] <= metrics["fde_3s"]
 
 
-def test_in_bf16_the_loss_is_float32_and_close(tmp_path: Path) -> None:
-    config = tiny({"train": {"precision": "bf16"}, "network": {"dropout": 0.0}})
+def test_predicted_uncertainty_is_trained_and_measured(tmp_path: Path) -> None:
+    """Of what it saw, it then expects more than at the start."""
+    config = replace(tiny({"network": {"uncertainty": True}}), augment=None)
+    windows = tiny_data().held_out
+    data = TrainingData(Pool.of(windows), windows, tiny_data().source)
+    before = evaluate(new_state(config, torch.device("cpu")).average, windows, 0.1)
+    after = evaluate(train(config.with_steps(60), data, tmp_path).average, windows, 0.1)
+    assert after["nll"] < before["nll"] - 0.1
+    assert 0.0 < after["inside_50"] < after["inside_90"] <= 1.0
+    checkpoint = load_checkpoint(tmp_path / "model.safetensors")
+    assert checkpoint.card.metrics == after
+    assert set(after) - set(checkpoint.card.baseline) == {"nll", "inside_50", "inside_90"}
+    assert predict(checkpoint.network, tiny_data().held_out).end_covariances is not None
+
+
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_in_bf16_the_loss_is_float32_and_close(tmp_path: Path, uncertainty: bool) -> None:
+    network = {"dropout": 0.0, "uncertainty": uncertainty}
+    config = tiny({"train": {"precision": "bf16"}, "network": network})
     windows = tiny_data().held_out.tensors()
     losses = []
     for precision in ("float32", "bf16"):

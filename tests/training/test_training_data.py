@@ -55,6 +55,23 @@ def test_weights_tell_targets_driving_and_standing_windows_apart(scenes: Path) -
     assert pool.samples_per_epoch == round(pool.weights.sum())
 
 
+def test_a_share_of_the_recordings_is_trained_on_and_all_that_are_held_out_measure(
+    scenes: Path,
+) -> None:
+    def trained_on(share: float) -> set[int]:
+        data = opened(scenes, DataConfig(held_out=("1", "2"), train_share=share))
+        assert len(data.held_out) == 2
+        return set(data.pool.gather(np.arange(len(data.pool))).recording)
+
+    assert trained_on(1.0) == set(range(2, SCENES))
+    assert trained_on(0.3) < trained_on(0.6) < trained_on(1.0)
+
+
+def test_a_share_that_leaves_nothing_is_told(scenes: Path) -> None:
+    with pytest.raises(EqrtError, match="no recording is left by held_out and train_share 1e-09"):
+        opened(scenes, DataConfig(held_out=("1",), train_share=1e-9))
+
+
 def test_several_datasets_are_trained_on_together_and_each_is_measured_its_own_way(
     scenes: Path,
 ) -> None:

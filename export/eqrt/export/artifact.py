@@ -6,6 +6,8 @@ import hashlib
 import re
 import shutil
 import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +21,25 @@ from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
 from eqrt.export.to_onnx import to_onnx
-from eqrt.export.vectors import named_scenes
-from eqrt.runtime.prediction.predictor import Predictor
+from eqrt.export.vectors import TURNED, TWINS, named_scenes
+from eqrt.runtime.prediction.predictor import Predictor, disagreement
 from eqrt.training.checkpoint import Card
 
 AGREEMENT_M = 1e-3
-"""PyTorch and the file must agree within a millimetre."""
+"""PyTorch and the file must agree within a millimetre (`disagreement`)."""
+EQUIVARIANT_M = 5e-3
+"""What turning a scene 500 m away may change by float32's rounding."""
+
+Tensors = Mapping[str, NDArray[np.float32]]
+"""A network's outputs by the contract's names."""
 
 
 def write_artifact(model: nn.Module, contract: ModelContract, card: Card, folder: Path) -> float:
     """Export `model`, verify it, and put it at `folder` (replacing an artifact there).
 
     Returns the largest disagreement between PyTorch and the file in metres. Raises EqrtError if
-    that is above AGREEMENT_M or the runtime's own Predictor refuses the result.
+    that is above AGREEMENT_M or the runtime's own Predictor refuses the result, ValueError if the
+    model's outputs are not the contract's.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
@@ -42,48 +50,57 @@ def write_artifact(model: nn.Module, contract: ModelContract, card: Card, folder
             "license": card.license,
             "non_commercial": str(card.non_commercial).lower(),
         }
+        scenes = named_scenes(contract)
+        expected = {name: _expected(model, contract, scene) for name, scene in scenes.items()}
         (draft / "model.onnx").write_bytes(to_onnx(model, contract, metadata))
         (draft / "contract.json").write_text(contract.to_json() + "\n", encoding="utf-8")
-        (draft / "README.md").write_text(_model_card(contract, card), encoding="utf-8")
-        scenes = named_scenes(contract)
+        text = _model_card(contract, card, _turned_apart_m(expected))
+        (draft / "README.md").write_text(text, encoding="utf-8")
         for index, (name, scene) in enumerate(scenes.items()):
-            _write_vector(model, scene, draft / f"test_data_set_{index}", name)
+            _write_vector(scene, expected[name], draft / f"test_data_set_{index}", name)
         _write_checksums(draft)
-        error = _read_back(model, scenes, draft)
+        error = _read_back(draft, scenes, expected)
         if folder.exists():
             shutil.rmtree(folder)
         draft.rename(folder)
     return error
 
 
-def reference(model: nn.Module, scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The torch network's own answer for a scene: (B, K, H, 2) tile frame, (B, K)."""
+def reference(model: nn.Module, scene: Scene) -> tuple[NDArray[np.float32], ...]:
+    """The torch network's own answer for a scene: the contract's outputs, in order."""
     with torch.no_grad():
-        trajectories, probabilities = model(*map(torch.from_numpy, scene.inputs().values()))
-    return trajectories.numpy(), probabilities.numpy()
+        outputs = model(*map(torch.from_numpy, scene.inputs().values()))
+    return tuple(output.numpy() for output in outputs)
 
 
-def _read_back(model: nn.Module, scenes: dict[str, Scene], folder: Path) -> float:
+def _expected(model: nn.Module, contract: ModelContract, scene: Scene) -> Tensors:
+    outputs = reference(model, scene)
+    if len(outputs) != len(contract.outputs):
+        names = ", ".join(contract.outputs)
+        raise ValueError(f"the network has {len(outputs)} outputs, the contract has {names}")
+    return dict(zip(contract.outputs, outputs, strict=True))
+
+
+def _read_back(folder: Path, scenes: Mapping[str, Scene], expected: Mapping[str, Tensors]) -> float:
     predictor = Predictor.load(folder)
     worst = 0.0
     for name, scene in scenes.items():
-        found = predictor.predict(scene)
-        trajectories, probabilities = reference(model, scene)
-        error = float(np.abs(found.trajectories - scene.origin - trajectories).max())
-        error = max(error, float(np.abs(found.probabilities - probabilities).max()))
-        if not error <= AGREEMENT_M:
-            raise EqrtError(
-                f"{folder.name}: on the scene {name!r} the file and PyTorch differ by {error:.4g} m"
-                f" (allowed {AGREEMENT_M}); the exporter translated something wrongly"
-            )
-        worst = max(worst, error)
+        prediction = predictor.predict(replace(scene, origin=np.zeros(2)))
+        for output, value in expected[name].items():
+            error = disagreement(output, getattr(prediction, output), value)
+            if not error <= AGREEMENT_M:
+                raise EqrtError(
+                    f"{folder.name}: on the scene {name!r} the {output} of the file and of PyTorch "
+                    f"differ by {error:.4g} (allowed {AGREEMENT_M}); the exporter translated "
+                    "something wrongly"
+                )
+            worst = max(worst, error)
     return worst
 
 
-def _write_vector(model: nn.Module, scene: Scene, folder: Path, name: str) -> None:
+def _write_vector(scene: Scene, outputs: Tensors, folder: Path, name: str) -> None:
     """One test vector in the ONNX convention: input_*.pb, output_*.pb."""
     folder.mkdir()
-    outputs = dict(zip(("trajectories", "probabilities"), reference(model, scene), strict=True))
     for side, tensors in (("input", scene.inputs()), ("output", outputs)):
         for index, (tensor_name, value) in enumerate(tensors.items()):
             _write_tensor(folder / f"{side}_{index}.pb", tensor_name, value)
@@ -99,15 +116,24 @@ def _metric(name: str) -> str:
     """How a table calls a metric: `ade_3s` is ADE 3 s."""
     if of_mean := re.fullmatch(r"(ade|fde)_(\d+)s", name):
         return f"{of_mean[1].upper()} {of_mean[2]} s"
-    return {"min_ade": "minADE", "min_fde": "minFDE", "miss_rate": "miss rate, share"}[name]
+    if ellipse := re.fullmatch(r"inside_(\d+)", name):
+        return f"truth inside the {ellipse[1]} % ellipse, share"
+    others = {"min_ade": "minADE", "min_fde": "minFDE", "miss_rate": "miss rate, share"}
+    return (others | {"nll": "NLL, nats"})[name]
+
+
+def _number(value: float | None) -> str:
+    """Constant velocity does not say how sure it is."""
+    return "" if value is None else f"{value:.3f}"
 
 
 def _what_counts(contract: ModelContract) -> str:
+    known = "; NLL and ellipses of the end" if contract.covariances else ""
     if contract.num_modes == 1:
-        return "mean and final displacement of the trajectory"
+        return f"mean and final displacement of the trajectory{known}"
     return (
         "ADE and FDE of the most probable trajectory; minADE, minFDE and miss rate of the best of "
-        f"{contract.num_modes}"
+        f"{contract.num_modes}{known}"
     )
 
 
@@ -126,14 +152,32 @@ def _write_checksums(folder: Path) -> None:
     (folder / "SHA256SUMS").write_text("".join(lines), encoding="utf-8")
 
 
-def _model_card(contract: ModelContract, card: Card) -> str:
+def _turned_apart_m(expected: Mapping[str, Tensors]) -> float:
+    """How far the predictions for turned scenes lie from the turned predictions, metres."""
+    return max(
+        float(np.abs(TURNED.apply(before.astype(np.float64)) - after).max())
+        for before, after in (
+            (expected[scene]["trajectories"], expected[twin]["trajectories"])
+            for twin, scene in TWINS.items()
+        )
+    )
+
+
+def _model_card(contract: ModelContract, card: Card, turned_apart_m: float) -> str:
+    """The text; `turned_apart_m` as `_turned_apart_m` measures it."""
     rows = "".join(
-        f"| {_metric(name)} | {value:.3f} | {card.baseline[name]:.3f} |\n"
+        f"| {_metric(name)} | {value:.3f} | {_number(card.baseline.get(name))} |\n"
         for name, value in card.metrics.items()
     )
     tensors = "".join(
         f"| `{name}` | {kind} | ({', '.join(map(str, shape))}) |\n"
         for name, (kind, shape) in (contract.inputs | contract.outputs).items()
+    )
+    turning = (
+        "turning or shifting that frame turns or shifts the prediction and nothing else"
+        if turned_apart_m < EQUIVARIANT_M
+        else f"the model is not equivariant: where the test vectors are turned, it predicts up to "
+        f"{turned_apart_m:.2g} m off"
     )
     modes = f"{contract.num_modes} trajectories" if contract.num_modes > 1 else "one trajectory"
     return f"""# {contract.name} {contract.version}
@@ -160,7 +204,7 @@ Errors on held-out recordings, metres ({_what_counts(contract)}):
 | --- | --- | --- |
 {tensors}
 All positions are metres in one local frame (x east, y north) whose origin lies within 1 km of the
-car; turning or shifting that frame turns or shifts the prediction and nothing else.
+car; {turning}.
 
 Limits: it knows vehicles on roads like those in its data; not pedestrians or cyclists, nor other
 countries' roads. It predicts what usually happens; it is no guarantee of what will.

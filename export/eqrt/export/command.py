@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     """Export, verify, and say what was written."""
     checkpoint = load_checkpoint(args.checkpoint)
     model, card = checkpoint.network, checkpoint.card
-    contract = checkpoint.config.scene.contract(card.name, args.model_version)
+    contract = checkpoint.config.contract(card.name, args.model_version)
     error = write_artifact(model, contract, card, args.out)
     size = (args.out / "model.onnx").stat().st_size
     print(f"artifact       {args.out}")

@@ -101,6 +101,7 @@ def _describe(proto: onnx.ModelProto, contract: ModelContract, metadata: dict[st
         "centerlines_valid": "True = exists; all False = no map",
         "trajectories": "metres, tile frame, steps of dt after now, most probable mode first",
         "probabilities": "of the modes; they sum to 1",
+        "covariances": "square metres, tile frame, of the trajectories' positions",
     }
     specs = contract.inputs | contract.outputs
     for value in (*proto.graph.input, *proto.graph.output):

@@ -20,6 +20,8 @@ RADIUS_M = 220.0
 LANE_WIDTH_M = 3.5
 TURNED = Pose2(-431.7, 212.3, 2.1)
 """Where the turned and shifted twin of a scene lies."""
+TWINS = {"driving_turned": "driving", "stopped_turned": "stopped_no_heading"}
+"""Scenes that are others, turned and shifted by TURNED."""
 FAR = Pose2(700.0, -700.0, 0.0)
 """The edge of a tile: 1 km from its origin."""
 

@@ -23,7 +23,12 @@ LANE_CHOICES = ("routes", "nearest")
 """`routes`: the ways through the lane graph that the target may go, then other lanes. `nearest`:
 single lanes, the nearest first, as the papers have it. See the core modules of these names."""
 
-UNITS = {"position": "m", "time": "s", "frame": "tile: x east, y north"}
+UNITS = {
+    "position": "m",
+    "covariance": "m^2",
+    "time": "s",
+    "frame": "tile: x east, y north",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +55,8 @@ class ModelContract:
     """Time between steps; the same for history and horizon."""
     lane_choice: str = "routes"
     """How the centerlines are chosen: one of LANE_CHOICES."""
+    covariances: bool = False
+    """Whether there is a third output, how uncertain each position is (`eqrt.core.metrics`)."""
 
     def __post_init__(self) -> None:
         for name in _SIZES:
@@ -86,10 +93,14 @@ class ModelContract:
     @property
     def outputs(self) -> dict[str, tuple[str, tuple[int | str, ...]]]:
         """Output name -> (element type, shape), in order."""
-        return {
-            "trajectories": ("float32", ("B", self.num_modes, self.horizon_steps, 2)),
-            "probabilities": ("float32", ("B", self.num_modes)),
+        modes, steps = self.num_modes, self.horizon_steps
+        outputs: dict[str, tuple[str, tuple[int | str, ...]]] = {
+            "trajectories": ("float32", ("B", modes, steps, 2)),
+            "probabilities": ("float32", ("B", modes)),
         }
+        if self.covariances:
+            outputs["covariances"] = ("float32", ("B", modes, steps, 2, 2))
+        return outputs
 
     def to_json(self) -> str:
         """The text of `contract.json`, and of the `eqrt_contract` metadata entry."""
@@ -116,7 +127,8 @@ class ModelContract:
                 f"{where}: model contract schema {values.get('schema')} is not supported (this "
                 f"runtime speaks {SCHEMA}); re-export the model with this version of eqrt"
             )
-        values = {"lane_choice": "routes", **values}  # what artifacts before it meant
+        # What artifacts from before these fields meant.
+        values = {"lane_choice": "routes", "covariances": False, **values}
         arguments: dict[str, Any] = {f.name: _typed(values, f.name, where) for f in fields(cls)}
         return cls(**arguments)
 
@@ -133,11 +145,10 @@ _MAX_SIZE = 1024  # far above any sensible model, low enough that a bad file can
 
 
 def _typed(values: Mapping[str, object], name: str, where: str) -> object:
-    kind: type | tuple[type, ...] = int if name in _SIZES else str
-    if name == "dt_s":
-        kind = (int, float)
+    kinds: dict[str, tuple[type, ...]] = {"dt_s": (int, float), "covariances": (bool,)}
+    kind = kinds.get(name, (int,) if name in _SIZES else (str,))
     value = values.get(name)
-    if not isinstance(value, kind) or isinstance(value, bool):
+    if not isinstance(value, kind) or (isinstance(value, bool) and bool not in kind):
         raise ContractError(
             f"{where}: model contract field {name!r} is {value!r}; re-export the model"
         )

@@ -1,4 +1,4 @@
-"""Displacement errors, as the field defines them (Argoverse motion forecasting).
+"""Displacement errors, as the field defines them (Argoverse motion forecasting), and calibration.
 
 ADE: mean distance to the truth over the steps up to a horizon; FDE: distance at that horizon.
 
@@ -6,6 +6,10 @@ Of K modes, the *best* is the one that ends nearest to the truth, the more proba
 minFDE is its FDE, and minADE is *its* ADE: so does the evaluation code of Argoverse 1 and 2, and so
 do the papers that report on them. The least ADE of any mode would be smaller or equal, but would
 take the two numbers from two different trajectories. With one mode, minADE is ADE and minFDE FDE.
+
+A predicted covariance C stands for an elliptical exponential distribution with the shape S = C / 3:
+at a Mahalanobis length m = |S^-1/2 offset| its density is exp(-m) / (2 pi |S|^1/2), and the share
+of it within m is 1 - (1 + m) exp(-m).
 """
 
 from __future__ import annotations
@@ -17,6 +21,12 @@ Float64 = NDArray[np.float64]
 
 MISS_M = 2.0
 """A best mode that ends farther than this from the truth has missed it."""
+
+COVARIANCE_OF_SHAPE = 3.0
+"""Of the elliptical exponential distribution in the plane: its covariance is so many times S."""
+LENGTH_OF_SHARE = {50: 1.6783469900, 90: 3.8897201698}
+"""Percent -> the Mahalanobis length m with 1 - (1 + m) exp(-m) of it: an ellipse's size."""
+_LEAST = 1e-12  # where a logarithm would meet zero
 
 
 def displacement(trajectories: Float64, truth: Float64) -> Float64:
@@ -80,3 +90,65 @@ def brier_min_fde(distance: Float64, probabilities: Float64) -> Float64:
     share = probabilities / probabilities.sum(axis=-1, keepdims=True)
     best = np.take_along_axis(share, best_mode(distance)[..., None], axis=-1)[..., 0]
     return np.asarray(min_fde(distance) + np.square(1.0 - best))
+
+
+def mahalanobis(offset: Float64, covariances: Float64) -> Float64:
+    """Lengths m (...) of offsets (..., 2) in metres under covariances (..., 2, 2)."""
+    shape, determinant = _shape(covariances)
+    x, y = offset[..., 0], offset[..., 1]
+    square = (
+        shape[..., 1, 1] * x**2 - 2 * shape[..., 0, 1] * x * y + shape[..., 0, 0] * y**2
+    ) / determinant
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+
+
+def log_density(offset: Float64, covariances: Float64) -> Float64:
+    """Logarithms (...) of the density per square metre at offsets (..., 2), likewise."""
+    _, determinant = _shape(covariances)
+    area = np.log(2 * np.pi) + 0.5 * np.log(determinant)
+    return np.asarray(-mahalanobis(offset, covariances) - area)
+
+
+def surprise(offset: Float64, covariances: Float64, probabilities: Float64) -> Float64:
+    """(B,) nats: minus the logarithm of the density that all K modes together gave the truth.
+
+    Of offsets (B, K, 2) from each mode to the truth in metres, covariances (B, K, 2, 2) and
+    probabilities (B, K), made to sum to 1. Lower is better; being wrong and sure costs most.
+    """
+    share = probabilities / probabilities.sum(axis=-1, keepdims=True)
+    of_mode = log_density(offset, covariances) + np.log(np.maximum(share, _LEAST))
+    return np.asarray(-np.logaddexp.reduce(of_mode, axis=-1))
+
+
+def inside(offset: Float64, covariances: Float64, percent: int) -> NDArray[np.bool_]:
+    """(...) whether offsets (..., 2) lie in the ellipse that holds so many percent.
+
+    `percent` is a key of LENGTH_OF_SHARE. Of a predictor that knows its errors, as many are inside.
+    """
+    return np.asarray(mahalanobis(offset, covariances) < LENGTH_OF_SHARE[percent])
+
+
+def calibration(
+    trajectories: Float64, probabilities: Float64, covariances: Float64, truth: Float64
+) -> dict[str, Float64]:
+    """How well a predictor knows its errors at the end of its horizon; each (B,).
+
+    `nll` is the surprise of all modes, in nats; `inside_50` and `inside_90` whether the truth lies
+    in these ellipses of the best mode, 1 or 0. Of trajectories (B, K, H, 2), probabilities (B, K),
+    covariances (B, K, 2, 2) at the last step, and truth (B, H, 2).
+    """
+    offset = truth[:, None, -1] - trajectories[:, :, -1]  # (B, K, 2)
+    best = best_mode(np.linalg.norm(offset, axis=-1, keepdims=True))[:, None]
+    nearest = np.take_along_axis(offset, best[..., None], axis=1)[:, 0]
+    spread = np.take_along_axis(covariances, best[..., None, None], axis=1)[:, 0]
+    table = {"nll": surprise(offset, covariances, probabilities)}
+    for percent in LENGTH_OF_SHARE:
+        table[f"inside_{percent}"] = inside(nearest, spread, percent).astype(np.float64)
+    return table
+
+
+def _shape(covariances: Float64) -> tuple[Float64, Float64]:
+    """Shapes S (..., 2, 2) and their determinants (...), which stay above zero."""
+    shape = covariances / COVARIANCE_OF_SHAPE
+    determinant = shape[..., 0, 0] * shape[..., 1, 1] - shape[..., 0, 1] * shape[..., 1, 0]
+    return shape, np.maximum(determinant, _LEAST)

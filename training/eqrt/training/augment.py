@@ -1,8 +1,9 @@
 """Make clean recordings look like what a sensor in a car sees.
 
-The network is equivariant, so nothing is rotated or shifted here. What it must learn is that tracks
-begin late, have holes, jitter, that neighbours are hidden and that a map may be missing; and that
-there are parked cars, and faster and slower roads than the recorded ones.
+What a predictor must learn is that tracks begin late, have holes, jitter, that neighbours are
+hidden and that a map may be missing; and that there are parked cars, and faster and slower roads
+than the recorded ones. That roads lead everywhere an equivariant network need not learn: `rotated`
+is for the others.
 """
 
 from __future__ import annotations
@@ -20,40 +21,42 @@ GHOST_M = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AugmentConfig:
-    """Probabilities per window unless said otherwise."""
+    """Probabilities per window unless said otherwise; what is not given does not happen."""
 
-    mirrored: float
+    rotated: float = 0.0
+    """The whole scene, about the target, by any angle. An equivariant network cannot tell."""
+    mirrored: float = 0.0
     """The whole scene, as if seen in a mirror: traffic that keeps to the other side."""
-    scaled: float
+    scaled: float = 0.0
     """The whole scene, lanes and future too, is made larger or smaller: other speeds."""
-    max_scale: float
+    max_scale: float = 1.0
     """The largest factor; the smallest is its inverse."""
-    parked: float
+    parked: float = 0.0
     """The target has always stood where it is, and stays."""
-    standing: float
+    standing: float = 0.0
     """So has everybody: a queue."""
-    clutter: float
+    clutter: float = 0.0
     """Per neighbour: it is a thing beside the road that has never moved."""
-    ghost: float
+    ghost: float = 0.0
     """Per neighbour: it is a second reflection of the target, within some metres."""
-    alone: float
+    alone: float = 0.0
     """Every neighbour is hidden."""
-    short_history: float
+    short_history: float = 0.0
     """The target and its neighbours were first seen only some steps ago."""
-    missing_step: float
+    missing_step: float = 0.0
     """Per step and agent."""
-    hidden_neighbour: float
+    hidden_neighbour: float = 0.0
     """Per neighbour."""
-    missing_line: float
+    missing_line: float = 0.0
     """Per centerline."""
-    line_offset_m: float
+    line_offset_m: float = 0.0
     """Standard deviation, of where each centerline lies: maps are not exact."""
-    no_map: float
+    no_map: float = 0.0
     """Every centerline at once."""
-    unknown_heading: float
-    heading_noise_rad: float
+    unknown_heading: float = 0.0
+    heading_noise_rad: float = 0.0
     """Standard deviation."""
-    position_noise_m: float
+    position_noise_m: float = 0.0
     """Standard deviation of the noisiest windows; each window draws its own below it."""
 
 
@@ -71,6 +74,8 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
     batch = _ghosts(batch, chance(config.ghost, windows, agents), generator)
     batch = _scaled(batch, _scales(windows, config, generator))
     batch = _mirrored(batch, chance(config.mirrored, windows))
+    if config.rotated:
+        batch = _rotated(batch, chance(config.rotated, windows), generator)
     steps = batch["history_valid"].shape[2]
     lines = batch["centerlines_valid"].shape[1]
     first = torch.randint(0, steps, (windows, 1, 1), generator=generator)
@@ -147,6 +152,22 @@ def _mirrored(batch: Batch, chosen: Tensor) -> Batch:
     heading = batch["heading"] * torch.stack([torch.ones_like(sign), sign], -1)
     turned = {name: flipped(batch[name]) for name in ("history", "centerlines", "future")}
     return batch | turned | {"heading": heading}
+
+
+def _rotated(batch: Batch, chosen: Tensor, generator: torch.Generator) -> Batch:
+    """The windows chosen (B,), each turned about the target's last place by an angle of its own."""
+    angle = 2.0 * torch.pi * torch.rand(len(chosen), generator=generator) * chosen
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    turn = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -2)  # for rows
+    here = batch["history"][:, 0, -1]  # (B, 2)
+
+    def turned(points: Tensor) -> Tensor:
+        center = here.view(-1, *[1] * (points.dim() - 2), 2)
+        flat = (points - center).flatten(1, -2) @ turn
+        return center + flat.view(points.shape)
+
+    scene = {name: turned(batch[name]) for name in ("history", "centerlines", "future")}
+    return batch | scene | {"heading": (batch["heading"].unsqueeze(1) @ turn).squeeze(1)}
 
 
 def _noise(history: Tensor, config: AugmentConfig, generator: torch.Generator) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 
 import safetensors
@@ -39,6 +39,10 @@ class Card:
     steps: int
     """Optimizer steps behind these weights."""
     seed: int
+    recordings: int = 0
+    """How many recordings were trained on; 0 in older cards, which do not say."""
+    samples: int = 0
+    """Windows trained on, each counted as often as it was drawn; 0 likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +120,9 @@ def load_tensors(path: Path, network: nn.Module, tensors: Mapping[str, Tensor]) 
 
 def _read_card(text: str) -> Card:
     values = json.loads(text)
-    names = {field.name for field in fields(Card)}
-    if set(values) != names:
-        raise ValueError(f"the card's fields differ: {', '.join(sorted(set(values) ^ names))}")
+    known = {field.name for field in fields(Card)}
+    needed = {field.name for field in fields(Card) if field.default is MISSING}
+    wrong = sorted((needed - set(values)) | (set(values) - known))
+    if wrong:
+        raise ValueError(f"the card's fields differ: {', '.join(wrong)}")
     return Card(**values)

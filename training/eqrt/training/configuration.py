@@ -37,6 +37,9 @@ class DataConfig:
     """Steps between windows (`WindowOptions`). Without either, prepared data is taken as it is."""
     held_out: tuple[str, ...] = ()
     """Recordings or groups to evaluate on and never train on (`Split`); empty = the data's own."""
+    train_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
+    """Of the groups of recordings that are not held out, how many to train on: how much do fewer
+    cost? Drawn by their names, so that a smaller share is part of a larger one."""
     focal_weight: Weight = 1.0
     """How often in an epoch a window of the dataset's own targets is drawn, on average."""
     driving_weight: Weight = 1.0
@@ -134,6 +137,10 @@ class TrainConfig:
     def with_steps(self, steps: int) -> TrainConfig:
         """The same for another length."""
         return replace(self, train=replace(self.train, steps=steps, epochs=None))
+
+    def with_train_share(self, share: float) -> TrainConfig:
+        """The same on another share of the recordings."""
+        return replace(self, data=replace(self.data, train_share=share))
 
 
 _TABLES = {"scene", "network", "data", "train"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,7 +11,14 @@ from torch import nn
 
 from eqrt.core.errors import EqrtError
 from eqrt.core.kinematics import constant_velocity
-from eqrt.core.metrics import displacement, error_table, min_ade, min_fde, miss_rate
+from eqrt.core.metrics import (
+    calibration,
+    displacement,
+    error_table,
+    min_ade,
+    min_fde,
+    miss_rate,
+)
 from eqrt.training.dataset.windows import Windows
 
 INPUTS = ("history", "history_valid", "heading", "centerlines", "centerlines_valid")
@@ -17,15 +26,35 @@ INPUTS = ("history", "history_valid", "heading", "centerlines", "centerlines_val
 _BATCH = 256
 
 
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """What is said of W windows; tile frame."""
+
+    trajectories: NDArray[np.float64]
+    """(W, K, H, 2) metres, most probable mode first."""
+    probabilities: NDArray[np.float64]
+    """(W, K)"""
+    end_covariances: NDArray[np.float64] | None = None
+    """(W, K, 2, 2) square metres, at the horizon; None where none are predicted."""
+
+
 def evaluate(network: nn.Module, windows: Windows, dt_s: float) -> dict[str, float]:
     """Errors over complete windows.
 
     ADE/FDE at 1, 2, 3 s of the most probable mode, and if there are more also the best mode's
-    `min_ade`, `min_fde` (metres) and `miss_rate` (0 to 1), at the horizon.
+    `min_ade`, `min_fde` (metres) and `miss_rate` (0 to 1), at the horizon. Of a network that
+    predicts covariances also `nll` (nats), `inside_50` and `inside_90` (0 to 1) there: how well it
+    knows its errors (`eqrt.core.metrics.calibration`).
     """
     complete = _complete(windows)
-    trajectories = predict(network, complete).astype(np.float64)
-    return _errors(trajectories, complete, trajectories.shape[1], dt_s)
+    predicted = predict(network, complete)
+    modes = predicted.trajectories
+    table = _errors(modes, complete, modes.shape[1], dt_s)
+    if predicted.end_covariances is not None:
+        truth = complete.future.astype(np.float64)
+        known = calibration(modes, predicted.probabilities, predicted.end_covariances, truth)
+        table |= {name: float(values.mean()) for name, values in known.items()}
+    return table
 
 
 def evaluate_constant_velocity(windows: Windows, num_modes: int, dt_s: float) -> dict[str, float]:
@@ -37,17 +66,22 @@ def evaluate_constant_velocity(windows: Windows, num_modes: int, dt_s: float) ->
     return _errors(course[:, None], complete, num_modes, dt_s)
 
 
-def predict(network: nn.Module, windows: Windows) -> NDArray[np.float32]:
-    """Trajectories (W, K, H, 2), tile frame; the network is in evaluation mode afterwards."""
+def predict(network: nn.Module, windows: Windows) -> Predicted:
+    """What the network says; it is in evaluation mode afterwards."""
     device = next(network.parameters()).device
     tensors = windows.tensors()
-    parts = []
+    parts: list[list[NDArray[np.float32]]] = []
     network.eval()
     with torch.no_grad():
         for start in range(0, len(windows), _BATCH):
             inputs = [tensors[name][start : start + _BATCH].to(device) for name in INPUTS]
-            parts.append(network(*inputs)[0].cpu().numpy())
-    return np.concatenate(parts)
+            trajectories, probabilities, *covariances = network(*inputs)
+            of_end = [values[:, :, -1] for values in covariances]  # all steps would fill the memory
+            outputs = [trajectories, probabilities, *of_end]
+            parts.append([output.cpu().numpy() for output in outputs])
+    return Predicted(
+        *(np.concatenate(pieces).astype(np.float64) for pieces in zip(*parts, strict=True))
+    )
 
 
 def _errors(

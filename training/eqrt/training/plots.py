@@ -41,14 +41,14 @@ def _figure(
     for name in names:
         values = [line[name] for line in lines]
         marker = "o" if len(values) < 50 else ""
-        (drawn,) = axes.plot(steps, values, label=_spoken(name), marker=marker, markersize=3)
+        (drawn,) = axes.plot(steps, values, label=spoken(name), marker=marker, markersize=3)
         if name in baseline:
             axes.axhline(
                 baseline[name],
                 color=drawn.get_color(),
                 linestyle="--",
                 linewidth=0.8,
-                label=f"{_spoken(name)}, constant velocity",
+                label=f"{spoken(name)}, constant velocity",
             )
     everything = [line[name] for line in lines for name in names]
     if 0.0 < min(everything) < max(everything) / _SPREAD:
@@ -61,16 +61,22 @@ def _figure(
     return figure
 
 
-def _spoken(name: str) -> str:
-    """`min_ade_3s` -> `min ADE 3 s`."""
+def spoken(name: str) -> str:
+    """A metric's name for people: `min_ade_3s` -> `min ADE 3 s`."""
     words = name.replace("_", " ").replace("ade", "ADE").replace("fde", "FDE")
     return words.removesuffix("s") + " s" if words[-2:-1].isdigit() else words
 
 
-def _save(figure: Figure, path: Path) -> list[Path]:
-    """Every format; the same figure gives the same SVG, byte for byte."""
-    written = [path.with_suffix(f".{kind}") for kind in FORMATS]
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a file of one of FORMATS; the same figure gives the same SVG, byte for byte."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    options = {"dpi": 120} if path.suffix == ".png" else {"metadata": {"Date": None}}
     with mpl.rc_context({"svg.hashsalt": "eqrt"}):
-        figure.savefig(written[0], dpi=120)
-        figure.savefig(written[1], metadata={"Date": None})
+        figure.savefig(path, **options)
+
+
+def _save(figure: Figure, path: Path) -> list[Path]:
+    written = [path.with_suffix(f".{kind}") for kind in FORMATS]
+    for file in written:
+        save_figure(figure, file)
     return written

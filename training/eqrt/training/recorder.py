@@ -136,6 +136,8 @@ class Recorder:
             parameters=sum(weight.numel() for weight in self._state.network.parameters()),
             steps=self._state.step,
             seed=config.train.seed,
+            recordings=data.recordings,
+            samples=self._state.step * config.train.batch_size,
         )
 
 

@@ -28,7 +28,7 @@ from eqrt.training.configuration import LoopConfig, TrainConfig, load_config
 from eqrt.training.dataset.store import license_notice
 from eqrt.training.evaluate import INPUTS
 from eqrt.training.loader import BatchMaker, Loader
-from eqrt.training.losses import LOSSES
+from eqrt.training.losses import LOSSES, whole_loss
 from eqrt.training.progress import Display, Lines, Silence, new_display
 from eqrt.training.ranks import Ranks, alone, join_ranks
 from eqrt.training.recorder import MODEL_FILE, STATE_FILE, Goal, Recorder
@@ -58,6 +58,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume", action="store_true", help="go on from the state in --out, if there is one"
     )
     parser.add_argument("--steps", type=int, help="instead of the configuration's")
+    parser.add_argument(
+        "--train-share",
+        type=float,
+        metavar="SHARE",
+        help="of the recordings to train on, instead of the configuration's (0 to 1)",
+    )
     parser.add_argument("--threads", type=int, default=1, help="CPU threads to compute (default 1)")
     parser.add_argument(
         "--loader-threads", type=int, default=1, help="threads that make batches (default 1)"
@@ -157,11 +163,8 @@ def train_step(
     model.train()
     in_bf16 = config.precision == "bf16"
     with torch.autocast(batch["future"].device.type, torch.bfloat16, enabled=in_bf16):
-        trajectories, probabilities = model(*(batch[name] for name in INPUTS))
-    # In float32: bf16 knows 50 m only in steps of 0.25 m, and the loss is about centimetres.
-    loss = LOSSES[config.loss](
-        trajectories.float(), probabilities.float(), batch["future"], batch["future_valid"]
-    )
+        outputs = model(*(batch[name] for name in INPUTS))
+    loss = whole_loss(LOSSES[config.loss], outputs, batch["future"], batch["future_valid"])
     optimizer.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.max_grad_norm)
@@ -214,6 +217,10 @@ def _config(args: argparse.Namespace) -> TrainConfig:
         value = getattr(args, option)
         if value is not None and value < 1:
             raise UsageError(f"--{option.replace('_', '-')} is {value}, expected 1 or more")
+    if args.train_share is not None:
+        if not 0.0 < args.train_share <= 1.0:
+            raise UsageError(f"--train-share is {args.train_share}, expected above 0 to 1")
+        config = config.with_train_share(args.train_share)
     return config.with_steps(args.steps) if args.steps else config
 
 
@@ -233,6 +240,7 @@ def _command(args: argparse.Namespace, resume: bool = False) -> str:
     words += [word for path in args.data for word in ("--data", path)]
     words += ["--out", args.out]
     words += ["--steps", args.steps] if args.steps else []
+    words += [] if args.train_share is None else ["--train-share", args.train_share]
     for option in ("threads", "loader_threads"):
         words += [f"--{option.replace('_', '-')}", getattr(args, option)]
     words += ["--device", args.device]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError
 from eqrt.training.configuration import DataConfig, TrainConfig
-from eqrt.training.dataset.split import Split
+from eqrt.training.dataset.split import Split, in_share
 from eqrt.training.dataset.store import WindowStore, open_data
 from eqrt.training.dataset.windows import MIN_DRIVE_M, Windows, join
 from eqrt.training.recordings.recording import Source
@@ -29,6 +29,8 @@ class TrainingData:
     held_out: Windows
     """Complete windows; of the dataset's own targets where it names them."""
     source: Source
+    recordings: int = 0
+    """How many the pool's windows come from; 0 = not known."""
 
 
 def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingData:
@@ -44,9 +46,9 @@ def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingDa
     if config.data.held_out:
         stores = _split(stores, config.data.held_out, where)
     store = WindowStore.concat(stores)
-    rows = store.rows("train")
+    rows = _shared(store, store.rows("train"), config.data.train_share)
     if not len(rows):
-        raise EqrtError(f"{where}: every recording here is held out; nothing to train on")
+        raise EqrtError(f"{where}: {_why_none(config.data)}; nothing to train on")
     held_out = join([measured_windows(store, "val") for store in stores])
     if not len(held_out):
         count = len(store.rows("val"))
@@ -55,7 +57,8 @@ def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingDa
             "history and future; hold out more, or longer recordings"
         )
     pool = Pool(store, rows, _weights(config.data, store, rows))
-    return TrainingData(pool, held_out, store.source)
+    recordings = len(np.unique(store.column("recording")[rows]))
+    return TrainingData(pool, held_out, store.source, recordings)
 
 
 def measured_windows(store: WindowStore, split: str) -> Windows:
@@ -80,6 +83,19 @@ def _split(stores: Sequence[WindowStore], held_out: Sequence[str], where: str) -
     if missing:
         raise EqrtError(f"{where}: held-out recording or group {missing[0]} is not here")
     return split
+
+
+def _shared(store: WindowStore, rows: Rows, share: float) -> Rows:
+    """Those of the rows whose group is drawn."""
+    chosen = np.array([in_share(entry.group, share) for entry in store.recordings], np.bool_)
+    kept: Rows = rows[chosen[store.column("recording")[rows]]]
+    return kept
+
+
+def _why_none(config: DataConfig) -> str:
+    if config.train_share < 1.0:
+        return f"no recording is left by held_out and train_share {config.train_share}"
+    return "every recording here is held out"
 
 
 def _weights(config: DataConfig, store: WindowStore, rows: Rows) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from eqrt.export.evaluation.selection import Choice, Selection, select, turned
 from eqrt.export.evaluation.tally import Tally, errors_of, membership
 from eqrt.runtime.prediction.guard import guard
 from eqrt.training.dataset.windows import Windows
+from eqrt.training.evaluate import Predicted
 from eqrt.training.recordings.recording import Source
 
 Float64 = NDArray[np.float64]
@@ -130,16 +131,19 @@ def _errors(
 ) -> dict[str, dict[str, Float64]]:
     """Predictor -> error -> (W,): of the model, of what the car would publish, of the others."""
     card, truth = model.card, windows.future.astype(np.float64)
-    trajectories, probabilities = model.predict(windows)
-    if not (np.isfinite(trajectories).all() and np.isfinite(probabilities).all()):
+    predicted = model.predict(windows)
+    modes, probabilities = predicted.trajectories, predicted.probabilities
+    parts = [modes, probabilities, predicted.end_covariances]
+    if not all(np.isfinite(part).all() for part in parts if part is not None):
         raise EqrtError(f"{card.path}: predicts what is not a number; it cannot be evaluated")
     history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
-    guarded = guard(trajectories, probabilities, history, valid, card.dt_s)
+    guarded = guard(modes, probabilities, history, valid, card.dt_s)
+    published = Predicted(guarded.trajectories, guarded.probabilities)
     errors = {
-        MODEL: errors_of(trajectories, probabilities, truth, card.dt_s),
-        PUBLISHED: errors_of(guarded.trajectories, guarded.probabilities, truth, card.dt_s)
+        MODEL: errors_of(predicted, truth, card.dt_s),
+        PUBLISHED: errors_of(published, truth, card.dt_s)
         | {REFUSED: (~guarded.accepted).astype(np.float64)},
     }
     for name, predict in others.items():
-        errors[name] = errors_of(*predict(windows), truth, card.dt_s)
+        errors[name] = errors_of(predict(windows), truth, card.dt_s)
     return errors

@@ -100,7 +100,7 @@ def rank(model: Model, selection: Selection, batch_size: int) -> Ranking:
     rows, errors = [np.zeros(0, np.intp)], [np.zeros(0)]
     for batch in selection.batches(batch_size):
         if len(batch.windows):
-            trajectories, _ = model.predict(batch.windows)
+            trajectories = model.predict(batch.windows).trajectories
             truth = batch.windows.future.astype(np.float64)
             errors.append(min_fde(displacement(trajectories[:, :COMMON_MODES], truth[:, None])))
             rows.append(batch.rows)
@@ -110,10 +110,14 @@ def rank(model: Model, selection: Selection, batch_size: int) -> Ranking:
 def cases_of(model: Model, selection: Selection, rows: Rows) -> list[Case]:
     """The targets `rows` of the store, ready to be drawn."""
     windows = selection.store.gather(rows)
-    modes, probabilities = model.predict(windows)
+    predicted = model.predict(windows)
     card = model.card
-    velocity, _ = baselines(card.dt_s, card.horizon_steps)["constant velocity"](windows)
-    outcome = Outcome(modes=modes, probabilities=probabilities, velocity=velocity[:, 0])
+    velocity = baselines(card.dt_s, card.horizon_steps)["constant velocity"](windows)
+    outcome = Outcome(
+        modes=predicted.trajectories,
+        probabilities=predicted.probabilities,
+        velocity=velocity.trajectories[:, 0],
+    )
     names = [
         f"{selection.store.recordings[recording][0]}, step {step}, agent {agent}"
         for recording, step, agent in zip(

@@ -1,7 +1,7 @@
 """What is evaluated: an artifact as the car runs it, a checkpoint, and physics beside them.
 
 Every one maps W windows to trajectories (W, K, H, 2) in the tile frame, metres, and probabilities
-(W, K), the most probable mode first.
+(W, K), the most probable mode first; a model may also say how far off these may be.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -23,19 +24,19 @@ from eqrt.core.scene import Scene
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.training.checkpoint import Checkpoint, load_checkpoint
 from eqrt.training.dataset.windows import Windows
+from eqrt.training.evaluate import INPUTS, Predicted, predict
 from eqrt.training.recordings.formats import forbids_commerce
 
 Float64 = NDArray[np.float64]
 
 CHECKPOINT_NAME = "model.safetensors"
-INPUTS = ("history", "history_valid", "heading", "centerlines", "centerlines_valid")
 
 
 class Forecast(Protocol):
     """Predicts windows."""
 
-    def __call__(self, windows: Windows) -> tuple[Float64, Float64]:
-        """Trajectories (W, K, H, 2) tile frame, most probable first; probabilities (W, K)."""
+    def __call__(self, windows: Windows) -> Predicted:
+        """Of windows, in their order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +53,8 @@ class ModelCard:
     """First digits of the file's SHA-256."""
     modes: int
     """K."""
+    covariances: bool
+    """Whether it says how far off it may be."""
     horizon_steps: int
     dt_s: float
     license: str
@@ -89,10 +92,11 @@ def _load_artifact(folder: Path, threads: int) -> Model:
     predictor = Predictor.load(folder, threads)
     contract = predictor.contract
 
-    def predict(windows: Windows) -> tuple[Float64, Float64]:
+    def run(windows: Windows) -> Predicted:
         inputs = {name: getattr(windows, name) for name in INPUTS}
         found = predictor.predict(Scene(**inputs, origin=np.zeros(2)))  # stays in the tile frame
-        return found.trajectories, found.probabilities.astype(np.float64)
+        end = None if found.covariances is None else found.covariances[:, :, -1]
+        return Predicted(found.trajectories, found.probabilities.astype(np.float64), end)
 
     card = _card(
         folder,
@@ -102,20 +106,13 @@ def _load_artifact(folder: Path, threads: int) -> Model:
         license_=predictor.license,
         nc=predictor.non_commercial or forbids_commerce(predictor.license),
     )
-    return Model(card, contract, predict)
+    return Model(card, contract, run)
 
 
 def _from_checkpoint(path: Path, checkpoint: Checkpoint) -> Model:
     card, network = checkpoint.card, checkpoint.network
-    contract = checkpoint.config.scene.contract(card.name, "0.0.0")
+    contract = checkpoint.config.contract(card.name, "0.0.0")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-
-    def predict(windows: Windows) -> tuple[Float64, Float64]:
-        tensors = windows.tensors()
-        with torch.no_grad():
-            trajectories, probabilities = network(*(tensors[name] for name in INPUTS))
-        return trajectories.numpy().astype(np.float64), probabilities.numpy().astype(np.float64)
-
     told = _card(
         path,
         contract,
@@ -124,17 +121,17 @@ def _from_checkpoint(path: Path, checkpoint: Checkpoint) -> Model:
         license_=card.license,
         nc=card.non_commercial or forbids_commerce(card.license),
     )
-    return Model(told, contract, predict)
+    return Model(told, contract, partial(predict, network))
 
 
 def baselines(dt_s: float, horizon_steps: int) -> Mapping[str, Forecast]:
     """Constant velocity, and constant turn rate and velocity, of the target's own history."""
 
-    def velocity(windows: Windows) -> tuple[Float64, Float64]:
+    def velocity(windows: Windows) -> Predicted:
         history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
         return _one_mode(constant_velocity(history, valid, horizon_steps))
 
-    def turn(windows: Windows) -> tuple[Float64, Float64]:
+    def turn(windows: Windows) -> Predicted:
         history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
         motion = fit_motion(history, valid, dt_s)
         return _one_mode(constant_turn(history[:, -1], *motion, horizon_steps, dt_s))
@@ -142,8 +139,8 @@ def baselines(dt_s: float, horizon_steps: int) -> Mapping[str, Forecast]:
     return {"constant velocity": velocity, "constant turn rate": turn}
 
 
-def _one_mode(course: Float64) -> tuple[Float64, Float64]:
-    return course[:, None], np.ones((len(course), 1))
+def _one_mode(course: Float64) -> Predicted:
+    return Predicted(course[:, None], np.ones((len(course), 1)))
 
 
 def _card(
@@ -156,6 +153,7 @@ def _card(
         version=contract.version if kind == "artifact" else "",
         model_id=model_id,
         modes=contract.num_modes,
+        covariances=contract.covariances,
         horizon_steps=contract.horizon_steps,
         dt_s=contract.dt_s,
         license=license_,

@@ -80,7 +80,8 @@ def as_text(parts: Sequence[Measured], settings: Settings) -> str:
         lines += _data_lines(part.data)
     lines.append(_settings_line(settings))
     lines += _license_lines(model, [part.data.source for part in parts])
-    lines += ["", *_overall(model, tally), *_best_of(model, tally), "", *_by_group(model, tally)]
+    lines += ["", *_overall(model, tally), *_best_of(model, tally), *_calibration(model, tally)]
+    lines += ["", *_by_group(model, tally)]
     if len(parts) > 1:
         lines += ["", *_by_dataset(model, parts)]
     return "\n".join(lines) + "\n"
@@ -163,6 +164,18 @@ def _best_of(model: ModelCard, tally: Tally) -> list[str]:
         f"   missed {table[f'miss_rate_{modes}']:.1%}"
         f"   brier-minFDE {table[f'brier_min_fde_{modes}']:.3f}"
         for modes in mode_counts(model.modes)
+    ]
+
+
+def _calibration(model: ModelCard, tally: Tally) -> list[str]:
+    """How well the model knows its errors, where it says so."""
+    if not model.covariances:
+        return []
+    table = tally.means(0)[MODEL]
+    return [
+        f"{f'uncertainty, {_horizon(model)}':<{_NAME}}{int(tally.counts[0]):>9,}"
+        f"   NLL {table['nll']:.3f} nats   inside the 50 % ellipse {table['inside_50']:.1%}"
+        f", the 90 % {table['inside_90']:.1%}"
     ]
 
 

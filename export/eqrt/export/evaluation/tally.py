@@ -11,12 +11,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.metrics import brier_min_fde, displacement, min_ade, min_fde, missed
+from eqrt.core.metrics import (
+    brier_min_fde,
+    calibration,
+    displacement,
+    min_ade,
+    min_fde,
+    missed,
+)
 from eqrt.export.evaluation.manoeuvres import MANOEUVRES, SPEED_BANDS
+from eqrt.training.evaluate import Predicted
 
 Float64 = NDArray[np.float64]
 Errors = Mapping[str, Float64]
-"""Name -> (W,): metres, and for `miss_rate` 1 for a miss, else 0."""
+"""Name -> (W,): metres; 1 or 0 for what is counted (`miss_rate`, `inside_*`); `nll` in nats."""
 
 GROUPS = (
     ("all", "all"),
@@ -42,14 +50,14 @@ def mode_counts(num_modes: int) -> tuple[int, ...]:
     )
 
 
-def errors_of(
-    trajectories: Float64, probabilities: Float64, truth: Float64, dt_s: float
-) -> dict[str, Float64]:
-    """The errors of W targets: trajectories (W, K, H, 2), probabilities (W, K), truth (W, H, 2).
+def errors_of(predicted: Predicted, truth: Float64, dt_s: float) -> dict[str, Float64]:
+    """The errors of W targets, whose truth is (W, H, 2).
 
     `ade_*s`, `fde_*s` and `miss_rate` are those of the most probable mode; `*_K` of the best of the
-    K most probable. docs/evaluation.md defines each.
+    K most probable. Of covariances `nll`, `inside_50` and `inside_90`, of all K modes.
+    docs/evaluation.md defines each.
     """
+    trajectories, probabilities = predicted.trajectories, predicted.probabilities
     distance = displacement(trajectories, truth[:, None])  # (W, K, H)
     errors: dict[str, Float64] = {}
     for seconds in horizons_s(dt_s, truth.shape[1]):
@@ -63,6 +71,8 @@ def errors_of(
         errors[f"min_fde_{modes}"] = min_fde(likeliest)
         errors[f"miss_rate_{modes}"] = missed(likeliest).astype(np.float64)
         errors[f"brier_min_fde_{modes}"] = brier_min_fde(likeliest, probabilities[:, :modes])
+    if predicted.end_covariances is not None:
+        errors |= calibration(trajectories, probabilities, predicted.end_covariances, truth)
     return errors
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 DEFAULT_ARTIFACT = Path(__file__).parent / "models" / "eqrt-free"
 """The model that ships with eqrt."""
 SELF_CHECK_M = 1e-3
-"""A test vector must come back within a millimetre."""
+"""A test vector must come back within a millimetre (`disagreement`)."""
 MAX_BATCH = 16
 """Targets per run: memory stays bounded however many there are, and nothing gets slower."""
 
@@ -44,6 +44,8 @@ class Prediction:
     """(B, K, H, 2) metres, map frame, most probable mode first."""
     probabilities: NDArray[np.float32]
     """(B, K)"""
+    covariances: NDArray[np.float64] | None = None
+    """(B, K, H, 2, 2) square metres, map frame; None from a model that predicts none."""
 
 
 class Predictor:
@@ -97,8 +99,16 @@ class Predictor:
             )
             for at in range(0, len(scene.history), MAX_BATCH)
         ]
-        trajectories, probabilities = (np.concatenate(parts) for parts in zip(*runs, strict=True))
-        return Prediction(trajectories + scene.origin, probabilities)
+        found = {
+            name: np.concatenate(parts)
+            for name, parts in zip(self._outputs, zip(*runs, strict=True), strict=True)
+        }
+        covariances = found.get("covariances")  # the map frame's axes are the tile's
+        return Prediction(
+            found["trajectories"] + scene.origin,
+            found["probabilities"],
+            None if covariances is None else covariances.astype(np.float64),
+        )
 
     @property
     def license_notice(self) -> str | None:
@@ -115,14 +125,28 @@ class Predictor:
         expected = _tensors(vectors[0], "output", self.contract.outputs)
         found = self._session.run(self._outputs, feed)
         for name, value in zip(expected, found, strict=True):
-            same_shape = value.shape == expected[name].shape
-            with np.errstate(invalid="ignore"):  # a damaged vector may hold anything
-                error = float(np.abs(value - expected[name]).max()) if same_shape else np.inf
+            error = disagreement(name, value, expected[name])
             if not error <= SELF_CHECK_M:
                 raise ContractError(
                     f"{vectors[0]}: the model's {name} differ by {error:.4g} from the stored ones "
                     f"(allowed {SELF_CHECK_M}); this file or this onnxruntime is not to be trusted"
                 )
+
+
+def disagreement(name: str, found: NDArray[Any], expected: NDArray[Any]) -> float:
+    """How far an output tensor is from what it should be; infinite if the shapes differ.
+
+    Metres for `trajectories`, probability for `probabilities`. A covariance may be many square
+    metres: its difference is taken as a share of the expected one, or of 1 m^2 if that is more.
+    """
+    if found.shape != expected.shape:
+        return np.inf
+    with np.errstate(invalid="ignore", over="ignore"):  # a damaged vector may hold anything
+        difference = np.abs(found - expected)
+        if name == "covariances":
+            largest = np.abs(expected).max(axis=(-2, -1), keepdims=True)
+            difference = difference / np.maximum(largest, 1.0)
+        return float(difference.max())
 
 
 def _read_checked(folder: Path) -> bytes:

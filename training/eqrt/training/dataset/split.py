@@ -49,6 +49,17 @@ class Split:
 
 def split_of(group: str, seed: int, held_out_share: float) -> str:
     """TRAIN or VAL."""
-    digest = hashlib.sha256(f"{seed}:{group}".encode()).digest()
-    drawn = int.from_bytes(digest[:8], "big") / 2**64  # uniform in [0, 1)
-    return VAL if drawn < held_out_share else TRAIN
+    return VAL if _drawn(f"{seed}:{group}") < held_out_share else TRAIN
+
+
+def in_share(group: str, share: float) -> bool:
+    """Whether a group is among the `share` of all that a training may use.
+
+    Whatever is in a smaller share is in every larger one; it has nothing to do with the sides.
+    """
+    return _drawn(f"share:{group}") < share
+
+
+def _drawn(text: str) -> float:
+    """A number, uniform in [0, 1)."""
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64

@@ -9,6 +9,7 @@ No angle is ever formed: with the unit heading u, the rotation is [[u_x, u_y], [
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -55,17 +56,38 @@ def unit(vectors: Tensor) -> Tensor:
     return vectors / (vectors.square().sum(-1, keepdim=True) + _TINY**2).sqrt()
 
 
-def heading_vector(
-    moved: Tensor, heading: Tensor, directions: Tensor, distance2: Tensor, valid: Tensor
-) -> Tensor:
+@dataclass(frozen=True, slots=True)
+class LaneDirections:
+    """Which way the lanes around the targets lead; P points of all centerlines."""
+
+    directions: Tensor
+    """(B, P, 2) unit vectors."""
+    distance2: Tensor
+    """(B, P) squared distance of each point to the target, square metres."""
+    valid: Tensor
+    """(B, P) where there is a direction."""
+
+
+def lane_directions(points: Tensor, valid: Tensor, unit_m: float) -> LaneDirections:
+    """Of centerlines (B, Q, L, 2) relative to the targets, in units of `unit_m` metres.
+
+    valid (B, Q, L): which points exist; the others are 0.
+    """
+    directions, defined = point_directions(points, valid)
+    return LaneDirections(
+        directions=directions.flatten(1, 2),
+        distance2=points.square().sum(-1).flatten(1) * unit_m**2,
+        valid=(valid & defined).flatten(1),
+    )
+
+
+def heading_vector(moved: Tensor, heading: Tensor, lanes: LaneDirections) -> Tensor:
     """The unit heading (B, 2) of the targets; (0, 0) where nothing defines one.
 
     moved (B, 2): displacement over the last second, metres. heading (B, 2): measured, or 0.
-    directions (B, P, 2), distance2 (B, P), valid (B, P): lane directions (unit vectors), the
-    squared distance of their points to the target, and which of them exist.
     """
-    nearest = (-distance2 / (2 * NEAR_M**2)).masked_fill(~valid, -1e9).softmax(-1)
-    lane = unit((directions * (nearest * valid).unsqueeze(-1)).sum(-2))
+    nearest = (-lanes.distance2 / (2 * NEAR_M**2)).masked_fill(~lanes.valid, -1e9).softmax(-1)
+    lane = unit((lanes.directions * (nearest * lanes.valid).unsqueeze(-1)).sum(-2))
     measured = heading.square().sum(-1, keepdim=True).clamp(max=1.0)
     standing = measured * unit(heading) + (1.0 - measured) * lane
     length = (moved.square().sum(-1, keepdim=True) + _TINY**2).sqrt()

@@ -9,6 +9,10 @@ frame, which turns with the world (`canonical.heading_vector`); so every feature
 trajectory that is turned back is equivariant. A target without any direction (it stands, nothing
 measures its heading, no lane is near) has the zero matrix for a frame: it sees nothing that turns,
 and is predicted to stay on its course.
+
+What each choice is worth is measured by taking the other one: how the heading is read, whether
+anything is turned at all, and what a token of the map is. With `uncertainty` the network also says
+how far off it may be (`eqrt.training.networks.spread`).
 """
 
 from __future__ import annotations
@@ -19,18 +23,29 @@ import torch
 from torch import Tensor, nn
 
 from eqrt.training.networks.canonical import (
+    LaneDirections,
     canonical_from_tile,
     exact,
     heading_vector,
+    lane_directions,
     last_valid,
     masked,
-    point_directions,
 )
 from eqrt.training.networks.config import UNIT_M, SceneConfig
 from eqrt.training.networks.layers import mlp
 from eqrt.training.networks.motion import COURSE, SLOPE_STEPS, MotionFit, fitted_vectors
+from eqrt.training.networks.spread import SpreadDecoder, tile_covariances
+from eqrt.training.networks.target_frame import (
+    FRAMES,
+    HEADINGS,
+    check_choice,
+    one_step_heading,
+    upright,
+)
 from eqrt.training.networks.time_basis import BASIS, time_basis
 
+TOKENS = ("line", "point")
+"""What a token of the map is."""
 _MASKED = -1e9  # a finite minus infinity: a row without any valid token must not become NaN
 
 
@@ -47,18 +62,35 @@ class CompactConfig:
     """Layers in which the modes look at the tokens."""
     dropout: float
     """Share of updates dropped while training."""
+    heading: str = "robust"
+    """Which way the target faces: one of HEADINGS (`eqrt.training.networks.target_frame`)."""
+    frame: str = "rotated"
+    """One of FRAMES; `translated` turns nothing, so that the network is not equivariant."""
+    tokens: str = "line"
+    """One per centerline, or one per `point` of each, with the line's direction there."""
+    uncertainty: bool = False
+    """Whether covariances are predicted too, the third output."""
+
+    def __post_init__(self) -> None:
+        check_choice("heading", self.heading, HEADINGS)
+        check_choice("frame", self.frame, FRAMES)
+        check_choice("tokens", self.tokens, TOKENS)
+        if not isinstance(self.uncertainty, bool):
+            raise ValueError(f"uncertainty is {self.uncertainty!r}, expected true or false")
 
 
 class CompactPredictor(nn.Module):
-    """One token per agent, one per centerline."""
+    """One token per agent, one per centerline (or per point of it)."""
 
     def __init__(self, scene: SceneConfig, config: CompactConfig) -> None:
         super().__init__()
         width = config.width
+        self.heading, self.frame, self.tokens = config.heading, config.frame, config.tokens
         self.motion = MotionFit(scene)
         seen = 2 + 2 * fitted_vectors(scene) + scene.history_steps
         self.agent = mlp([seen, 2 * width, width])
-        self.lane = mlp([3 * scene.centerline_points, 2 * width, width])
+        of_lane = 3 * scene.centerline_points if config.tokens == "line" else 4
+        self.lane = mlp([of_lane, 2 * width, width])
         self.norm = nn.LayerNorm(width)
         self.layers = nn.ModuleList(
             TokenLayer(width, config.heads, config.dropout) for _ in range(config.layers)
@@ -72,17 +104,22 @@ class CompactPredictor(nn.Module):
         heading: Tensor,
         centerlines: Tensor,
         centerlines_valid: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Contract version 1: trajectories (B, K, H, 2) tile frame, probabilities (B, K)."""
+    ) -> tuple[Tensor, ...]:
+        """Contract version 1: trajectories (B, K, H, 2) tile frame, probabilities (B, K).
+
+        With uncertainty also covariances (B, K, H, 2, 2), square metres, tile frame.
+        """
         with exact(history):
             seen = self._see(history, history_valid, heading, centerlines, centerlines_valid)
         tokens = self.norm(torch.cat([self.agent(seen.agents), self.lane(seen.lines)], 1))
         for layer in self.layers:
             tokens = layer(tokens, tokens, seen.valid)
-        trajectories, probabilities = self.modes(tokens, seen.valid, seen.velocity)
+        drawn, probabilities, *factors = self.modes(tokens, seen.valid, seen.velocity)
         with exact(history):
-            turned_back = trajectories @ seen.canonical.transpose(-1, -2).unsqueeze(1)
-            return seen.origin[:, None, None, :] + UNIT_M * turned_back, probabilities
+            turned_back = drawn @ seen.canonical.transpose(-1, -2).unsqueeze(1)
+            trajectories = seen.origin[:, None, None, :] + UNIT_M * turned_back
+            covariances = [tile_covariances(factor, seen.canonical) for factor in factors]
+            return trajectories, probabilities, *covariances
 
     def _see(
         self,
@@ -98,32 +135,41 @@ class CompactPredictor(nn.Module):
         origin = last[:, 0]
         motion = self.motion(history, history_valid, last)
         points = masked((centerlines - origin[:, None, None, :]) / UNIT_M, centerlines_valid)
-        course = motion.velocity[:, 0, :, COURSE]
-        canonical = self._frame(course, heading, points, centerlines_valid)
+        lanes = lane_directions(points, centerlines_valid, UNIT_M)
+        if self.frame == "translated":
+            canonical = upright(origin)
+        elif self.heading == "one_step":
+            facing = one_step_heading(history[:, 0], history_valid[:, 0], heading, lanes)
+            canonical = canonical_from_tile(facing)
+        else:
+            moved = motion.velocity[:, 0, :, COURSE] * UNIT_M
+            canonical = canonical_from_tile(heading_vector(moved, heading, lanes))
         turn = canonical.transpose(-1, -2).unsqueeze(1)  # (B, 1, 2, 2), for columns
 
         exists = history_valid.any(-1)  # (B, N)
         place = masked((last - origin.unsqueeze(1)) / UNIT_M, exists) @ canonical
         vectors = (turn @ motion.vectors).flatten(2)
-        lines = (points @ canonical.unsqueeze(1)).flatten(2)  # (B, Q, 2 L)
+        lines, lines_valid = self._lines(points, centerlines_valid, lanes, canonical)
         return _Seen(
             origin=origin,
             canonical=canonical,
             agents=torch.cat([place, vectors, history_valid.to(place.dtype)], -1),
-            lines=torch.cat([lines, centerlines_valid.to(place.dtype)], -1),
-            valid=torch.cat([exists, centerlines_valid.any(-1)], 1),
+            lines=lines,
+            valid=torch.cat([exists, lines_valid], 1),
             velocity=turn[:, 0] @ motion.velocity[:, 0],
         )
 
-    def _frame(self, course: Tensor, heading: Tensor, points: Tensor, valid: Tensor) -> Tensor:
-        """The rotation (B, 2, 2) into the target's frame, for row vectors."""
-        direction, has_direction = point_directions(points, valid)
-        distance2 = points.square().sum(-1).flatten(1) * UNIT_M**2
-        usable = (valid & has_direction).flatten(1)
-        towards = heading_vector(
-            course * UNIT_M, heading, direction.flatten(1, 2), distance2, usable
-        )
-        return canonical_from_tile(towards)
+    def _lines(
+        self, points: Tensor, valid: Tensor, lanes: LaneDirections, canonical: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What is known of each token of the map, and which exist, from points (B, Q, L, 2)."""
+        if self.tokens == "point":
+            vectors = torch.cat(
+                [points.flatten(1, 2) @ canonical, lanes.directions @ canonical], -1
+            )
+            return vectors, valid.flatten(1)
+        lines = (points @ canonical.unsqueeze(1)).flatten(2)  # (B, Q, 2 L)
+        return torch.cat([lines, valid.to(lines.dtype)], -1), valid.any(-1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +183,10 @@ class _Seen:
     agents: Tensor
     """(B, N, .) where each agent is, how it moved, and when it was seen."""
     lines: Tensor
-    """(B, Q, 3 L) the points of each centerline, and which exist."""
+    """(B, Q, 3 L) the points of each centerline, and which exist; or (B, Q L, 4) each point, and
+    which way its line leads there."""
     valid: Tensor
-    """(B, N + Q) which agents and lines exist."""
+    """(B, N + Q) or (B, N + Q L): which agents, lines or points exist."""
     velocity: Tensor
     """(B, 2, S) the target's fitted velocities."""
 
@@ -178,7 +225,7 @@ class ModeDecoder(nn.Module):
     """K queries, one per mode, look at all tokens; each draws a trajectory.
 
     A trajectory is the target's mean course, a mixture of its fitted velocities, plus smooth
-    functions of time that are 0 now.
+    functions of time that are 0 now. With uncertainty, each mode also draws its spread.
     """
 
     time: Tensor
@@ -202,12 +249,14 @@ class ModeDecoder(nn.Module):
         time = torch.arange(1, self.steps + 1) * scene.dt_s
         self.register_buffer("time", time, persistent=False)
         self.register_buffer("basis", time_basis(self.steps), persistent=False)
+        spread = SpreadDecoder(width, self.steps, scene.dt_s) if config.uncertainty else None
+        self.spread = spread  # last, so that all other weights start as they would without
 
-    def forward(self, tokens: Tensor, valid: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, tokens: Tensor, valid: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
         """Tokens (B, M, W), the target's first; valid (B, M); its velocity (B, 2, S).
 
         Returns (B, K, H, 2), relative to the target, in its frame, network units, and (B, K); the
-        most probable mode first.
+        most probable mode first. With uncertainty also the factors (B, K, H, 2, 2) of `spread`.
         """
         queries = tokens[:, :1] + self.query
         for layer in self.layers:
@@ -220,8 +269,12 @@ class ModeDecoder(nn.Module):
             course = (share @ velocity.transpose(-1, -2)).unsqueeze(-2) * self.time.unsqueeze(-1)
             shape = drawn[..., : 2 * BASIS].unflatten(-1, (2, BASIS)) @ self.basis  # (B, K, 2, H)
             trajectories = course + shape.transpose(-1, -2)
+        factors = () if self.spread is None else (self.spread(queries),)
         if self.num_modes == 1:
-            return trajectories, probabilities
+            return trajectories, probabilities, *factors
         probabilities, order = probabilities.topk(self.num_modes, dim=-1)
-        order = order[..., None, None].expand(-1, -1, self.steps, 2)
-        return trajectories.gather(1, order), probabilities
+        places = order[..., None, None].expand(-1, -1, self.steps, 2)
+        ordered = [
+            factor.gather(1, places.unsqueeze(-1).expand(-1, -1, -1, -1, 2)) for factor in factors
+        ]
+        return trajectories.gather(1, places), probabilities, *ordered

@@ -66,6 +66,8 @@ class EqMotionConfig:
     """Of both convolutions."""
     image_width: int
     """First layer of the perceptron that reads the image."""
+    point_dropout: float = 0.0
+    """Share of the map's points that a training step does not read (attention, transformer)."""
 
 
 class EqMotion(nn.Module):
@@ -142,9 +144,11 @@ def map_encoder(scene: SceneConfig, config: EqMotionConfig) -> nn.Module | None:
     if config.map == "none":
         return None
     if config.map == "attention":
-        return AttentionEncoder(tokens, config.token_width, hidden)
+        return AttentionEncoder(tokens, config.token_width, hidden, config.point_dropout)
     if config.map == "transformer":
-        return TransformerEncoder(tokens, config.token_width, config.heads, hidden)
+        return TransformerEncoder(
+            tokens, config.token_width, config.heads, hidden, config.point_dropout
+        )
     if config.map == "raster":
         return RasterEncoder(
             config.image_pixels,

@@ -5,6 +5,10 @@ each other; then all of them, side by side, enter a perceptron. Only that readin
 paper's parameter counts: its 4.3 M for the transformer are 1,000 tokens x 64 x hidden 64, while the
 transformer layer itself has some tens of thousands. So the order of the lines matters, which is
 fixed (the nearest first); what is not valid enters as 0.
+
+Attention costs the square of the points. With `point_dropout` a training step reads only some of
+them, others each time, which also keeps a perceptron of millions of weights from learning few
+scenes by heart. As ever with dropout, what is left counts for more, and nothing is dropped later.
 """
 
 from __future__ import annotations
@@ -20,27 +24,34 @@ _MASKED = -1e9  # a finite minus infinity: a row without any valid point must no
 class AttentionEncoder(nn.Module):
     """One plain self-attention layer of `graph_width`, one head, over all points."""
 
-    def __init__(self, tokens: int, graph_width: int, sizes: list[int]) -> None:
-        """`tokens`: Q * L. `sizes`: widths of the perceptron's layers."""
+    def __init__(
+        self, tokens: int, graph_width: int, sizes: list[int], dropout: float = 0.0
+    ) -> None:
+        """`tokens`: Q * L. `sizes`: widths of the perceptron's layers. `dropout`: of points."""
         super().__init__()
+        self.dropout = dropout
         self.qkv = nn.Linear(2, 3 * graph_width)
         self.perceptron = mlp([tokens * graph_width, *sizes])
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
         """Points (B, P, 2), 0 where not valid (B, P) -> the map's feature (B, D)."""
+        chosen = choose(points.shape[1], self.dropout) if self.training else None
+        points, valid = _of(chosen, points), _of(chosen, valid)
         attended = attend(self.qkv(points), valid, heads=1)
-        feature: Tensor = self.perceptron(_only(attended, valid).flatten(1))
-        return feature
+        return read_side_by_side(self.perceptron, _only(attended, valid), chosen)
 
 
 class TransformerEncoder(nn.Module):
     """One transformer encoder layer over all points: the method of the paper."""
 
-    def __init__(self, tokens: int, width: int, heads: int, sizes: list[int]) -> None:
-        """`tokens`: Q * L. `sizes`: widths of the perceptron's layers."""
+    def __init__(
+        self, tokens: int, width: int, heads: int, sizes: list[int], dropout: float = 0.0
+    ) -> None:
+        """`tokens`: Q * L. `sizes`: widths of the perceptron's layers. `dropout`: of points."""
         super().__init__()
         if width % heads:
             raise ValueError(f"token width {width} is not a multiple of {heads} heads")
+        self.dropout = dropout
         self.heads = heads
         self.embed = nn.Linear(2, width)
         self.qkv = nn.Linear(width, 3 * width)
@@ -54,12 +65,40 @@ class TransformerEncoder(nn.Module):
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
         """Points (B, P, 2), 0 where not valid (B, P) -> the map's feature (B, D)."""
+        chosen = choose(points.shape[1], self.dropout) if self.training else None
+        points, valid = _of(chosen, points), _of(chosen, valid)
         tokens = self.embed(points)  # (B, P, W)
         attended = attend(self.qkv(tokens), valid, self.heads)
         tokens = self.norm1(tokens + self.project(attended))
         tokens = self.norm2(tokens + self.feed_forward(tokens))
-        feature: Tensor = self.perceptron(_only(tokens, valid).flatten(1))
-        return feature
+        return read_side_by_side(self.perceptron, _only(tokens, valid), chosen)
+
+
+def choose(points: int, dropout: float) -> Tensor | None:
+    """Which of the points (torch's global generator) a training step reads; None = all."""
+    if not dropout:
+        return None
+    return torch.randperm(points)[: max(round((1.0 - dropout) * points), 1)]
+
+
+def read_side_by_side(perceptron: nn.Sequential, tokens: Tensor, chosen: Tensor | None) -> Tensor:
+    """Tokens (B, P, W), the `chosen` of all that the perceptron has weights for -> (B, D)."""
+    if chosen is None:
+        whole: Tensor = perceptron(tokens.flatten(1))
+        return whole
+    first, *rest = perceptron
+    assert isinstance(first, nn.Linear)
+    weight = first.weight.view(first.out_features, -1, tokens.shape[2])  # (D, all, W)
+    scale = weight.shape[1] / len(chosen)
+    seen = weight[:, chosen.to(weight.device)].flatten(1)
+    feature = nn.functional.linear(scale * tokens.flatten(1), seen, first.bias)
+    for layer in rest:
+        feature = layer(feature)
+    return feature
+
+
+def _of(chosen: Tensor | None, per_point: Tensor) -> Tensor:
+    return per_point if chosen is None else per_point[:, chosen.to(per_point.device)]
 
 
 def attend(qkv: Tensor, valid: Tensor, heads: int) -> Tensor:

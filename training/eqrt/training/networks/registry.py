@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any
 
 from torch import nn
 
+from eqrt.core.contract import ModelContract
 from eqrt.training.networks.compact import CompactConfig, CompactPredictor
 from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.eqmotion import EqMotion, EqMotionConfig
@@ -53,6 +54,11 @@ class ModelConfig:
             "network": {"kind": self.kind, **asdict(self.network)},
         }
 
+    def contract(self, name: str, version: str) -> ModelContract:
+        """The contract that an artifact of this network promises."""
+        draws_spread = isinstance(self.network, CompactConfig) and self.network.uncertainty
+        return replace(self.scene.contract(name, version), covariances=draws_spread)
+
 
 def build_network(config: ModelConfig) -> nn.Module:
     """A new network with random weights (torch's global generator)."""
@@ -60,8 +66,9 @@ def build_network(config: ModelConfig) -> nn.Module:
 
 
 def _fill(kind: type[Any], values: Mapping[str, Any], table: str) -> Any:
+    """`kind(**values)`; a field that has a default may be missing."""
     names = {field.name for field in fields(kind)}
-    if set(values) != names:
-        wrong = ", ".join(sorted(names ^ set(values)))
-        raise ValueError(f"[{table}] has missing or unknown fields: {wrong}")
+    needed = {field.name for field in fields(kind) if field.default is MISSING}
+    if wrong := sorted((needed - set(values)) | (set(values) - names)):
+        raise ValueError(f"[{table}] has missing or unknown fields: {', '.join(wrong)}")
     return kind(**values)

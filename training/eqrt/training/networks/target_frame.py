@@ -1,4 +1,4 @@
-"""Where the target stands and which way it faces: the frame in which the map is read.
+"""Where the target stands and which way it faces: the frame that things are read in.
 
 The paper takes the direction of the target's last displacement (`one_step`). It is the noisiest of
 all, and undefined for a target that stands; there, the measured heading or else the nearest lane
@@ -14,17 +14,18 @@ import torch
 from torch import Tensor
 
 from eqrt.training.networks.canonical import (
+    LaneDirections,
     canonical_from_tile,
     heading_vector,
+    lane_directions,
     last_valid,
     masked,
-    point_directions,
     unit,
 )
 from eqrt.training.networks.config import UNIT_M
 
 FRAMES = ("translated", "rotated")
-"""What is done to the map: `translated` to the target only, or also `rotated` to its heading."""
+"""What is done to positions: `translated` to the target only, or also `rotated` to its heading."""
 HEADINGS = ("one_step", "robust")
 """From which motion the heading is read."""
 STILL_M = 0.02
@@ -50,10 +51,8 @@ class TargetFrame:
 
     def __init__(self, frame: str, heading: str, dt_s: float) -> None:
         """Raise ValueError for a choice that is not in FRAMES, HEADINGS."""
-        if frame not in FRAMES:
-            raise ValueError(f"frame is {frame!r}, expected one of {', '.join(FRAMES)}")
-        if heading not in HEADINGS:
-            raise ValueError(f"heading is {heading!r}, expected one of {', '.join(HEADINGS)}")
+        check_choice("frame", frame, FRAMES)
+        check_choice("heading", heading, HEADINGS)
         self.rotated = frame == "rotated"
         self.robust = heading == "robust"
         self.dt_s = dt_s
@@ -70,8 +69,7 @@ class TargetFrame:
         origin = last_valid(history, history_valid)  # (B, 2)
         points = masked(centerlines - origin[:, None, None, :], centerlines_valid) / UNIT_M
         if not self.rotated:
-            upright = torch.eye(2, dtype=points.dtype, device=points.device)
-            return MapPoints(points, centerlines_valid, upright.expand(points.shape[0], 2, 2))
+            return MapPoints(points, centerlines_valid, upright(origin))
         facing = self._facing(history, history_valid, heading, points, centerlines_valid)
         turn = canonical_from_tile(facing)
         turned = points.flatten(1, 2) @ turn
@@ -81,17 +79,36 @@ class TargetFrame:
         self, history: Tensor, valid: Tensor, heading: Tensor, points: Tensor, points_valid: Tensor
     ) -> Tensor:
         """The unit heading (B, 2); (0, 0) where nothing defines one."""
-        direction, has_direction = point_directions(points, points_valid)
-        lanes = direction.flatten(1, 2)
-        distance2 = points.flatten(1, 2).square().sum(-1) * UNIT_M**2
-        lanes_valid = (points_valid & has_direction).flatten(1)
+        lanes = lane_directions(points, points_valid, UNIT_M)
         if self.robust:
             moved = fitted_velocity(history, valid, self.dt_s)  # metres in one second
-            return heading_vector(moved, heading, lanes, distance2, lanes_valid)
-        step = last_step(history, valid)
-        standing = heading_vector(torch.zeros_like(step), heading, lanes, distance2, lanes_valid)
-        moves = step.square().sum(-1, keepdim=True) > STILL_M**2
-        return torch.where(moves, unit(step), standing)
+            return heading_vector(moved, heading, lanes)
+        return one_step_heading(history, valid, heading, lanes)
+
+
+def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    """Raise ValueError if a setting is not one of its choices."""
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
+
+
+def upright(origin: Tensor) -> Tensor:
+    """The frame (B, 2, 2) of targets at `origin` (B, 2) that is not turned at all."""
+    identity = torch.eye(2, dtype=origin.dtype, device=origin.device)
+    return identity.expand(origin.shape[0], 2, 2)
+
+
+def one_step_heading(
+    history: Tensor, valid: Tensor, heading: Tensor, lanes: LaneDirections
+) -> Tensor:
+    """The unit heading (B, 2) of the paper; (0, 0) where nothing defines one.
+
+    The target's masked history (B, T, 2) in metres, valid (B, T), measured heading (B, 2) or 0.
+    """
+    step = last_step(history, valid)
+    standing = heading_vector(torch.zeros_like(step), heading, lanes)
+    moves = step.square().sum(-1, keepdim=True) > STILL_M**2
+    return torch.where(moves, unit(step), standing)
 
 
 def last_step(history: Tensor, valid: Tensor) -> Tensor:
