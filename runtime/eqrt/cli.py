@@ -38,6 +38,11 @@ COMMANDS = {
         "draw predictions: the worst, and a sample (extra: train)",
     ),
     "export": ("eqrt.export.command", "turn a checkpoint into an ONNX artifact (extra: export)"),
+    "info": ("eqrt.runtime.verify.info", "say what an artifact is: sizes, licence, errors"),
+    "verify": (
+        "eqrt.runtime.verify.command",
+        "check that an artifact keeps its contract: a table, a verdict",
+    ),
     "encode": ("eqrt.export.encode", "turn a recorded scenario into a CAN log and its tile"),
 }
 EXTRA_OF = {  # third-party module -> the extra that brings it

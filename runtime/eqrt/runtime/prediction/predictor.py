@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from eqrt.core.contract import METADATA_KEY, ModelContract
 from eqrt.core.errors import ContractError
 from eqrt.core.scene import Scene
-from eqrt.runtime.prediction.tensor_proto import read_tensor
+from eqrt.runtime.prediction.stored_vectors import read_vector, vector_folders
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -31,9 +31,6 @@ SELF_CHECK_M = 1e-3
 """A test vector must come back within a millimetre (`disagreement`)."""
 MAX_BATCH = 16
 """Targets per run: memory stays bounded however many there are, and nothing gets slower."""
-
-TensorSpecs = Mapping[str, tuple[str, tuple[int | str, ...]]]
-"""Tensor name -> (element type, shape), as `ModelContract` gives them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,14 +115,13 @@ class Predictor:
         return f"model licence: {self.license}, non-commercial ({self.contract.name})"
 
     def _self_check(self, folder: Path) -> None:
-        vectors = sorted(folder.glob("test_data_set_*"))
+        vectors = vector_folders(folder)
         if not vectors:
             raise ContractError(f"{folder}: no test_data_set_*; export the model again")
-        feed = _tensors(vectors[0], "input", self.contract.inputs)
-        expected = _tensors(vectors[0], "output", self.contract.outputs)
-        found = self._session.run(self._outputs, feed)
-        for name, value in zip(expected, found, strict=True):
-            error = disagreement(name, value, expected[name])
+        vector = read_vector(vectors[0], self.contract)
+        found = self._session.run(self._outputs, vector.scene.inputs())
+        for (name, expected), value in zip(vector.outputs.items(), found, strict=True):
+            error = disagreement(name, value, expected)
             if not error <= SELF_CHECK_M:
                 raise ContractError(
                     f"{vectors[0]}: the model's {name} differ by {error:.4g} from the stored ones "
@@ -209,18 +205,3 @@ def _check_tensors(session: Any, contract: ModelContract, folder: Path) -> None:
         raise ContractError(
             f"{folder / 'model.onnx'}: tensor {next(iter(found))!r} is not in the contract"
         )
-
-
-def _tensors(folder: Path, side: str, specs: TensorSpecs) -> dict[str, NDArray[Any]]:
-    """A stored test vector's tensors, as the contract wants them, all of one batch."""
-    tensors: dict[str, NDArray[Any]] = {}
-    for i, (name, (kind, shape)) in enumerate(specs.items()):
-        path = folder / f"{side}_{i}.pb"
-        tensors[name] = tensor = read_tensor(path)
-        batch = len(next(iter(tensors.values()))) if tensor.ndim else 0
-        if tensor.dtype != kind or tensor.shape != (batch, *shape[1:]) or not batch:
-            raise ContractError(
-                f"{path}: {name} is {tensor.dtype} {list(tensor.shape)}, the contract says {kind} "
-                f"{list(shape)}; export the model again"
-            )
-    return tensors

@@ -6,7 +6,6 @@ message in the ONNX specification (onnx/onnx.proto), float32 and bool.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import ContractError
+from eqrt.runtime.prediction.protobuf import fields, varints
 
 _DIMS, _DATA_TYPE, _RAW_DATA = 1, 2, 9
 _DTYPES = {1: np.dtype("<f4"), 9: np.dtype(np.bool_)}  # TensorProto.DataType FLOAT and BOOL
@@ -32,53 +32,14 @@ def read_tensor(path: Path) -> NDArray[Any]:
 def parse_tensor(content: bytes) -> NDArray[Any]:
     """The array in a serialised TensorProto; ValueError, KeyError or IndexError if it is none."""
     dims: list[int] = []
-    data_type, raw = 0, b""
-    for field, value in _fields(content):
+    data_type, raw = 0, memoryview(b"")
+    for field, value in fields(content):
         if field == _DIMS:
-            dims += [value] if isinstance(value, int) else list(_varints(value))
+            dims += [value] if isinstance(value, int) else list(varints(value))
         elif field == _DATA_TYPE and isinstance(value, int):
             data_type = value
-        elif field == _RAW_DATA and isinstance(value, bytes):
+        elif field == _RAW_DATA and isinstance(value, memoryview):
             raw = value
     if any(size > len(raw) for size in dims):
         raise ValueError(f"{len(raw)} bytes for the shape {dims}")
     return np.frombuffer(raw, _DTYPES[data_type]).reshape(dims)
-
-
-def _fields(content: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Field numbers and values: an int for a varint, bytes for a length-delimited field."""
-    at = 0
-    while at < len(content):
-        key, at = _varint(content, at)
-        field, wire_type = key >> 3, key & 7
-        if wire_type == 0:
-            value, at = _varint(content, at)
-            yield field, value
-        elif wire_type == 2:
-            size, at = _varint(content, at)
-            if at + size > len(content):
-                raise ValueError("truncated")
-            yield field, content[at : at + size]
-            at += size
-        else:
-            raise ValueError(f"wire type {wire_type}")
-
-
-def _varints(content: bytes) -> Iterator[int]:
-    at = 0
-    while at < len(content):
-        value, at = _varint(content, at)
-        yield value
-
-
-def _varint(content: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = content[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-        shift += 7
-        if shift > 63:
-            raise ValueError("a number longer than 64 bits")
