@@ -30,6 +30,8 @@ CONTRACT = ModelContract(
     num_modes=1,
     dt_s=0.1,
 )
+MADE_VECTORS = 22
+"""Test vectors of the artifact."""
 _KINDS = {"float32": 1, "int64": 7, "bool": 9}
 
 Node = tuple[str, Sequence[str], str, Mapping[str, int]]
@@ -137,7 +139,7 @@ def _write_vectors(folder: Path, contract: ModelContract, model: bytes) -> None:
     options.log_severity_level = 3  # it tells of constants that only other flaws use
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     rng, plain = np.random.default_rng(3), hostile_scenes(contract)["plain"]
-    for index in range(12):
+    for index in range(MADE_VECTORS):
         scene = moved(plain, random_pose(plain, rng))
         vector = folder / f"test_data_set_{index}"
         vector.mkdir()

@@ -1,1 +1,1 @@
-BprobabilitiesJf∫ã>»/h>O,N>˛Ÿ>Ö˙—=__Y=
+BprobabilitiesJ2Ú•>Édõ>4¸_>.U–=ÖA.=Å∂<

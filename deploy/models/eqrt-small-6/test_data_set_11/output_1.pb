@@ -1,1 +1,1 @@
-BprobabilitiesJ…¥j>LŒ_>ÔèA>/‰)>Å_Õ=œX¿=
+BprobabilitiesJrL¦>¼Þ›>MÙ_>Q¡Ï=gí*=LE<

@@ -1,1 +1,1 @@
-BprobabilitiesJÖ¹> jŒ>`ho>Ìœ>ëœ„=I7v<
+BprobabilitiesJ§¥r>†g>}8:>å<3>àYÀ=ýc°=

@@ -1,1 +1,1 @@
-BprobabilitiesJ2ò¥>ƒd›>4ü_>.UÐ=…A.=¶<
+BprobabilitiesJX)m>ÅPh>á_>µ[5>VÚ•=Û·”=

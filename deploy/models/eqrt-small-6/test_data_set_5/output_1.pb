@@ -1,1 +1,1 @@
-BprobabilitiesJrL¦>¼Þ›>MÙ_>Q¡Ï=gí*=LE<
+BprobabilitiesJ»_>³&X>,›C>kT">;	>‚µ¡=

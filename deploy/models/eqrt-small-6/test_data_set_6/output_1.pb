@@ -1,1 +1,1 @@
-BprobabilitiesJyL¦>¼Þ›>MÙ_>H¡Ï=Rí*=,E<
+BprobabilitiesJæN`>ÉÚ^>Ùi6>Î'4>B^>ÇÌ‰=

@@ -1,1 +1,1 @@
-BprobabilitiesJ๕	k>เ)`>8>ัP3>ณ&ั=ๅรม=
+BprobabilitiesJๆN`>ธฺ^>ึi6>ิ'4>P^>ีฬ=

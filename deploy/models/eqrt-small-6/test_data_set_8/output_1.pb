@@ -1,1 +1,1 @@
-BprobabilitiesJ|h>ฑ๏@>:>@/>จþ=FMฆ=
+BprobabilitiesJ๕	k>เ)`>8>ัP3>ณ&ั=ๅรม=

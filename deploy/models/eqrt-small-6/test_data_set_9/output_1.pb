@@ -1,1 +1,1 @@
-BprobabilitiesJƒq>ìÒc>Óa=>„ 1>†¹Ù=ìxž=
+BprobabilitiesJÖ¹> jŒ>`ho>Ìœ>ëœ„=I7v<

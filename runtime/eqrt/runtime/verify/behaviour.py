@@ -26,7 +26,7 @@ from eqrt.runtime.verify.scenes import (
     stacked,
 )
 
-MIN_VECTORS = 10
+MIN_VECTORS = 20
 """Fewer test vectors do not show much."""
 TURNS = 6
 """Every scene is turned and shifted so often."""

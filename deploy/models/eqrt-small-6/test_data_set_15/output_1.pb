@@ -1,0 +1,1 @@
+BprobabilitiesJih>¹ï@>ƒ„:>@/>c¨þ=JM¦=

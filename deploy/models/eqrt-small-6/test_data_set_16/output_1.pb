@@ -1,0 +1,1 @@
+BprobabilitiesJ¿Xk>Gõf>>–<>æ¨->È…Ä=ñ_Â=

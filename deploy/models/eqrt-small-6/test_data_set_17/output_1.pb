@@ -1,0 +1,1 @@
+BprobabilitiesJƒq>ìÒc>Óa=>„ 1>†¹Ù=ìxž=

@@ -1,0 +1,1 @@
+BprobabilitiesJ…ฅj>L_>ิ่A>/)>ล_ี=Xฟ=

@@ -1,0 +1,1 @@
+BprobabilitiesJŠïz>K7u>kÁ6>ùš1>Q¹°=5@ž=

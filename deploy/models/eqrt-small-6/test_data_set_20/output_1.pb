@@ -1,0 +1,1 @@
+BprobabilitiesJ|Øq>Ã-h>ÊjC>ÙŠ)>çà=Xë‘=

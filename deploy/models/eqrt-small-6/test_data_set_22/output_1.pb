@@ -1,0 +1,1 @@
+BprobabilitiesJXJ^>¹V>á@>Nž!>Ú‹>g$¡=

@@ -1,0 +1,1 @@
+BtrajectoriesJð4(ØÃ¦RUC_wØÃ YVCKÇØÃŸ_WCÙÃ¯eXCÒiÙÃÿjYC~¼ÙÃ\oZCÚÃ©r[C‹dÚÃÝt\CÏ¹ÚÃüu]CÍÛÃv^CrfÛÃAu_C©½ÛÃ—s`CaÜÃ4qaC‹mÜÃ1nbCÆÜÃ¥jcCÝÃ¤fdCNxÝÃ9beCéÑÝÃn]fCÙ+ÞÃBXgC"†ÞÃ²RhCÄàÞÃµLiCÁ;ßÃ=FjC—ßÃ<?kCÂòßÃ¢7lC±NàÃb/mCÐªàÃu&nCùáÃÜoCûbáÃ¤pC¾áÃêqCXâÃâüqC
