@@ -17,13 +17,14 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.export.artifact import write_artifact
 from eqrt.export.evaluation.manoeuvres import MANOEUVRES, SPEED_BANDS
-from eqrt.export.evaluation.measure import Piece, Settings, measure
+from eqrt.export.evaluation.measure import MODEL, Piece, Settings, measure
 from eqrt.export.evaluation.predictors import load_model
 from eqrt.export.evaluation.report import as_text
 from eqrt.export.evaluation.selection import Choice, select
 from eqrt.export.evaluation.tally import (
     GROUPS,
     Tally,
+    end_errors,
     errors_of,
     horizons_s,
     membership,
@@ -125,6 +126,29 @@ def test_errors_of_eight_modes_by_hand() -> None:
     }
     assert list(table) == list(expected)
     np.testing.assert_allclose([float(v[0]) for v in table.values()], list(expected.values()))
+
+
+def test_the_end_is_off_along_the_way_or_across_it() -> None:
+    """One goes 3 m too far north, one ends 2 m short and 1 m to the left of a way west."""
+    truth = np.zeros((2, 30, 2))
+    ends = np.array([[0.0, 3.0], [2.0, -1.0]])
+    modes = truth[:, None] + ends[:, None, None]
+    direction = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    found = end_errors(Predicted(modes, np.ones((2, 1))), truth, direction)
+    assert {name: values.tolist() for name, values in found.items()} == {
+        "along": [3.0, 2.0],
+        "across": [0.0, 1.0],
+        "ahead": [3.0, -2.0],
+    }
+
+
+def test_the_report_tells_wrong_speeds_from_wrong_ways(packed: Path, tmp_path: Path) -> None:
+    """The second target speeds up by 2 m/s, on a straight road: all that is wrong is along it."""
+    report = evaluate(tmp_path, "--data", packed)
+    table = errors(report, MODEL)
+    assert table["across"] < 0.3 < table["along"]
+    assert table["ahead"] < 0.0
+    assert table["fde_3s"] >= table["along"]
 
 
 def test_errors_are_given_at_whole_seconds_and_at_the_horizon() -> None:

@@ -72,7 +72,7 @@ def manoeuvres(windows: Windows) -> Index:
     future = windows.future.astype(np.float64)  # (W, H, 2)
     end = future[:, -1]
     heading = heading_now(windows)
-    end_heading = _heading_at_end(now, future)
+    end_heading = heading_at_end(windows)
     turned = _angle_between(heading, end_heading)
     lines = _Lines(windows.centerlines.astype(np.float64), windows.centerlines_valid)
     changed = _changes_lane(lines, (now, heading), (end, end_heading))
@@ -101,8 +101,10 @@ def heading_now(windows: Windows) -> Float64:
     return _unit(np.where(standing, np.where(unknown, leaves, measured), moved))
 
 
-def _heading_at_end(now: Float64, future: Float64) -> Float64:
-    """(W, 2) direction of the last chord of CHORD_STEPS and CHORD_M, or of the whole way."""
+def heading_at_end(windows: Windows) -> Float64:
+    """(W, 2) unit direction of the last chord of CHORD_STEPS and CHORD_M, or of the whole way."""
+    now = windows.history[:, 0, -1].astype(np.float64)
+    future = windows.future.astype(np.float64)
     path = np.concatenate([now[:, None], future], axis=1)  # (W, H + 1, 2)
     chord = path[:, -1:] - path  # (W, H + 1, 2)
     enough = np.linalg.norm(chord, axis=-1) >= CHORD_M

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError
-from eqrt.export.evaluation.manoeuvres import manoeuvres, speed_bands
+from eqrt.export.evaluation.manoeuvres import heading_at_end, manoeuvres, speed_bands
 from eqrt.export.evaluation.predictors import Forecast, Model, ModelCard, baselines, load_model
 from eqrt.export.evaluation.selection import Choice, Selection, select, turned
-from eqrt.export.evaluation.tally import Tally, errors_of, membership
+from eqrt.export.evaluation.tally import Tally, end_errors, errors_of, membership
 from eqrt.runtime.prediction.guard import guard
 from eqrt.training.dataset.windows import Windows
 from eqrt.training.evaluate import Predicted
@@ -146,4 +146,6 @@ def _errors(
     }
     for name, predict in others.items():
         errors[name] = errors_of(predict(windows), truth, card.dt_s)
+    direction = heading_at_end(windows)
+    errors[MODEL] |= end_errors(predicted, truth, direction)
     return errors

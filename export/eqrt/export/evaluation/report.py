@@ -80,7 +80,8 @@ def as_text(parts: Sequence[Measured], settings: Settings) -> str:
         lines += _data_lines(part.data)
     lines.append(_settings_line(settings))
     lines += _license_lines(model, [part.data.source for part in parts])
-    lines += ["", *_overall(model, tally), *_best_of(model, tally), *_calibration(model, tally)]
+    lines += ["", *_overall(model, tally), *_end(model, tally)]
+    lines += [*_best_of(model, tally), *_calibration(model, tally)]
     lines += ["", *_by_group(model, tally)]
     if len(parts) > 1:
         lines += ["", *_by_dataset(model, parts)]
@@ -153,6 +154,17 @@ def _overall(model: ModelCard, tally: Tally) -> list[str]:
             f"({refused:.1%}) for constant turn rate"
         )
     return lines
+
+
+def _end(model: ModelCard, tally: Tally) -> list[str]:
+    """Is it the speed or the way that is predicted wrongly?"""
+    table = tally.means(0)[MODEL]
+    side = "far" if table["ahead"] > 0.0 else "short"
+    return [
+        f"{f'where it ends, {_horizon(model)}':<{_NAME}}{int(tally.counts[0]):>9,}"
+        f"   along the way {table['along']:.3f}   across {table['across']:.3f}"
+        f"   on average {abs(table['ahead']):.3f} too {side}"
+    ]
 
 
 def _best_of(model: ModelCard, tally: Tally) -> list[str]:

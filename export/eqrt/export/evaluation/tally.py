@@ -76,6 +76,17 @@ def errors_of(predicted: Predicted, truth: Float64, dt_s: float) -> dict[str, Fl
     return errors
 
 
+def end_errors(predicted: Predicted, truth: Float64, direction: Float64) -> dict[str, Float64]:
+    """Where the most probable mode ends, as seen along the truth's own direction there (W, 2).
+
+    `along` and `across` are lengths; `ahead` has a sign, and is positive where it ends too far on.
+    """
+    offset = predicted.trajectories[:, 0, -1] - truth[:, -1]
+    ahead = (offset * direction).sum(axis=1)
+    left = direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0]
+    return {"along": np.abs(ahead), "across": np.abs(left), "ahead": ahead}
+
+
 def membership(speed_band: NDArray[np.intp], manoeuvre: NDArray[np.intp]) -> Float64:
     """(W, G) 1 where a target belongs to one of GROUPS, else 0; from indices (W,), (W,)."""
     return np.concatenate(
