@@ -1,7 +1,8 @@
 """The `eqrt` command: a table of subcommands, each imported only when it is the one asked for.
 
 A subcommand is a module with `add_arguments(parser)` and `run(args) -> int`; its docstring's first
-line is its help. Exit status: 0 done, 1 the user can fix it, 2 wrong usage or a missing extra.
+line is its help. Exit status: 0 done, 1 the user can fix it, 2 wrong usage or a missing extra, 3 a
+budget is broken or something became slower.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ COMMANDS = {
     "verify": (
         "eqrt.runtime.verify.command",
         "check that an artifact keeps its contract: a table, a verdict",
+    ),
+    "bench": (
+        "eqrt.runtime.bench.command",
+        "measure the model on this machine: latency, memory, verdict",
     ),
     "encode": ("eqrt.export.encode", "turn a recorded scenario into a CAN log and its tile"),
 }

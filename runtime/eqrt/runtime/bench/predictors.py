@@ -1,0 +1,138 @@
+"""The workloads of `eqrt bench`: the model, and beside it what physics costs.
+
+All answer the same question with the same result: trajectories in the map frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eqrt.core.contract import ModelContract
+from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
+from eqrt.core.scene import Scene
+from eqrt.runtime.bench.scenes import ScenePool
+from eqrt.runtime.bench.schedule import CLOCK, Clock
+from eqrt.runtime.prediction.predictor import Predictor
+
+MODEL = "model"
+"""The name of the workload that is judged; the others are there for comparison."""
+
+
+class TimedSession:
+    """An onnxruntime session that adds up the time spent in it."""
+
+    def __init__(self, session: Any, clock: Clock) -> None:
+        self._session = session
+        self._clock = clock
+        self.spent_ns = 0
+
+    def run(self, outputs: list[str], feed: dict[str, Any]) -> Any:
+        """As the session's own."""
+        started_ns = self._clock()
+        found = self._session.run(outputs, feed)
+        self.spent_ns += self._clock() - started_ns
+        return found
+
+
+class TimedPredictor(Predictor):
+    """The predictor of the car, unchanged, that knows how long its model ran."""
+
+    def __init__(self, session: Any, contract: ModelContract, sha256: str, metadata: Any) -> None:
+        self.session = TimedSession(session, CLOCK)
+        super().__init__(self.session, contract, sha256, metadata)
+        self.sha256 = sha256
+        """Of `model.onnx`, all 64 digits."""
+
+
+def load_timed(artifact: Path, threads: int) -> TimedPredictor:
+    """Check and load an artifact. Raises ContractError, as `Predictor.load`."""
+    return TimedPredictor.load(artifact, threads)
+
+
+class ModelWorkload:
+    """One prediction of so many targets."""
+
+    name = MODEL
+    stages = ("gather", "infer", "map frame")
+    """Taking the targets' inputs from the pool; running the graph; everything else that
+    `Predictor.predict` does: cutting batches, joining results, going back to the map frame."""
+
+    def __init__(self, predictor: TimedPredictor, pool: ScenePool, targets: int) -> None:
+        self._predictor = predictor
+        self._pool = pool
+        self._targets = targets
+
+    def run(self, number: int) -> Sequence[int]:
+        """Predict once; nanoseconds per stage."""
+        session = self._predictor.session
+        session.spent_ns = 0
+        started_ns = CLOCK()
+        scene = self._pool.draw(number, self._targets)
+        gathered_ns = CLOCK()
+        self._predictor.predict(scene)
+        ended_ns = CLOCK()
+        spent_ns = session.spent_ns
+        return gathered_ns - started_ns, spent_ns, ended_ns - gathered_ns - spent_ns
+
+
+class PhysicsWorkload:
+    """The same targets, by physics alone, in numpy."""
+
+    stages = ("gather", "predict")
+
+    def __init__(
+        self, name: str, pool: ScenePool, targets: int, horizon_steps: int, dt_s: float
+    ) -> None:
+        """`name`: one of PHYSICS."""
+        self.name = name
+        self._predict = PHYSICS[name]
+        self._pool = pool
+        self._targets = targets
+        self._horizon_steps = horizon_steps
+        self._dt_s = dt_s
+
+    def run(self, number: int) -> Sequence[int]:
+        """Predict once; nanoseconds per stage."""
+        started_ns = CLOCK()
+        scene = self._pool.draw(number, self._targets)
+        gathered_ns = CLOCK()
+        self._predict(scene, self._horizon_steps, self._dt_s)
+        return gathered_ns - started_ns, CLOCK() - gathered_ns
+
+
+def _constant_velocity(scene: Scene, horizon_steps: int, _dt_s: float) -> Any:
+    history, valid = _own_history(scene)
+    return constant_velocity(history, valid, horizon_steps) + scene.origin
+
+
+def _constant_turn(scene: Scene, horizon_steps: int, dt_s: float) -> Any:
+    history, valid = _own_history(scene)
+    velocity, turn_rate_rad_s = fit_motion(history, valid, dt_s)
+    now = history[:, -1]
+    return constant_turn(now, velocity, turn_rate_rad_s, horizon_steps, dt_s) + scene.origin
+
+
+PHYSICS = {"constant velocity": _constant_velocity, "constant turn": _constant_turn}
+
+
+def _own_history(scene: Scene) -> tuple[Any, Any]:
+    """Of the targets alone: (B, T, 2), valid (B, T)."""
+    return scene.history[:, 0].astype(np.float64), scene.history_valid[:, 0]
+
+
+def workloads(
+    predictor: TimedPredictor, pool: ScenePool, targets: int
+) -> tuple[ModelWorkload | PhysicsWorkload, ...]:
+    """The model first, then physics."""
+    contract = predictor.contract
+    return (
+        ModelWorkload(predictor, pool, targets),
+        *(
+            PhysicsWorkload(name, pool, targets, contract.horizon_steps, contract.dt_s)
+            for name in PHYSICS
+        ),
+    )
