@@ -54,6 +54,17 @@ def test_runs_that_were_measured_on_other_targets_each_get_their_constant_veloci
     ]
 
 
+def test_constant_velocity_is_one_row_where_some_runs_were_measured_in_more_ways() -> None:
+    """A model of several modes has more metrics, and so has what it is compared with."""
+    metrics = {"ade_3s": 1.8, "fde_3s": 3.6, "min_ade": 0.9, "inside_50": 0.5}
+    several = replace(CARD, metrics=metrics, baseline=CARD.baseline | {"min_ade": 2.0})
+    rows = table([Run("one", CARD), Run("six", several), Run("again", CARD)])
+    assert rows[0].endswith("| ADE 3 s | FDE 3 s | min ADE | inside 50 |")
+    assert [row for row in rows if "velocity" in row] == [
+        "| constant velocity |  |  |  | 2.000 | 4.000 | 2.000 |  |"
+    ]
+
+
 def test_a_line_of_the_curve_joins_the_runs_of_one_configuration_by_how_much_they_saw() -> None:
     figure = curve([Run("all", CARD), Run("other", OTHER), Run("few", SMALLER)])
     turned, shifted, *_ = (line for line in figure.axes[0].lines if isinstance(line, Line2D))

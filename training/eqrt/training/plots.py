@@ -64,7 +64,7 @@ def _figure(
 def spoken(name: str) -> str:
     """A metric's name for people: `min_ade_3s` -> `min ADE 3 s`."""
     words = name.replace("_", " ").replace("ade", "ADE").replace("fde", "FDE")
-    return words.removesuffix("s") + " s" if words[-2:-1].isdigit() else words
+    return words.removesuffix("s") + " s" if words[-2:-1].isdigit() and words[-1] == "s" else words
 
 
 def save_figure(figure: Figure, path: Path) -> None:
