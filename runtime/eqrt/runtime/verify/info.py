@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import json
 import re
+import textwrap
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,10 @@ from eqrt.runtime.prediction.stored_vectors import vector_folders
 from eqrt.runtime.verify.form import read_contract
 
 Table = list[list[str]]
+
+WIDTH = 100
+"""Columns that the text takes at most."""
+_INDENT = 10  # columns of what a line is about
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,8 +88,8 @@ def render(facts: dict[str, Any]) -> str:
         "size": f"{parameters}{facts['nodes']} nodes, {facts['file_bytes'] / 1e6:.2f} MB",
         "file": f"ONNX opset {opset}, IR {facts['ir_version']}, by {facts['producer'] or '?'}, "
         f"{listed} SHA256SUMS lists it",
-        "predicts": f"{contract.horizon_steps * contract.dt_s:g} s "
-        f"in {contract.num_modes} mode{'s'[: contract.num_modes - 1]}, from "
+        "predicts": f"{contract.horizon_steps * contract.dt_s:g} s in {contract.num_modes} "
+        f"{'mode' if contract.num_modes == 1 else 'modes'}, from "
         f"{contract.history_steps * contract.dt_s:g} s",
         "sizes": f"N {contract.num_agents}, T {contract.history_steps}, "
         f"Q {contract.num_centerlines}, L {contract.centerline_points}, "
@@ -94,7 +99,7 @@ def render(facts: dict[str, Any]) -> str:
     }
     if facts["non_commercial"]:
         rows["licence"] += " -- NON-COMMERCIAL: not for commercial use"
-    lines = [f"{name:<9} {text}" for name, text in rows.items()]
+    lines = [line for name, text in rows.items() for line in _wrapped(f"{name:<{_INDENT}}{text}")]
     for side in ("inputs", "outputs"):
         tensors = [[name, *map(_text, spec)] for name, spec in facts[side].items()]
         lines += ["", *_columns([[side, "", ""], *tensors])]
@@ -102,6 +107,10 @@ def render(facts: dict[str, Any]) -> str:
         lines += ["", "what its model card says of held-out recordings, metres"]
         lines += _columns(facts["metrics"])
     return "\n".join(lines)
+
+
+def _wrapped(line: str) -> list[str]:
+    return textwrap.wrap(line, WIDTH, subsequent_indent=" " * _INDENT, break_on_hyphens=False)
 
 
 def _card(folder: Path) -> list[Table]:
