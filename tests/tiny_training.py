@@ -39,9 +39,9 @@ dt_s = 0.1
 [network]
 kind = "compact"
 width = 16
+hidden = 32
 heads = 2
 layers = 1
-decoder_layers = 1
 dropout = 0.1
 
 [data]

@@ -39,7 +39,7 @@ SCENE = SceneConfig(
     num_modes=3,
     dt_s=0.1,
 )
-NETWORK = CompactConfig(width=16, heads=2, layers=1, decoder_layers=1, dropout=0.1)
+NETWORK = CompactConfig(width=16, hidden=32, heads=2, layers=1, dropout=0.1)
 CARD = Card(
     name="test",
     data="made up",

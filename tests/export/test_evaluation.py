@@ -51,7 +51,7 @@ SCENE = SceneConfig(
     num_modes=8,
     dt_s=0.1,
 )
-NETWORK = CompactConfig(width=16, heads=2, layers=1, decoder_layers=1, dropout=0.0)
+NETWORK = CompactConfig(width=16, hidden=32, heads=2, layers=1, dropout=0.0)
 CARD = Card(
     name="eight-modes",
     data="made up",

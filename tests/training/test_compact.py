@@ -39,7 +39,7 @@ SCENE = SceneConfig(
     num_modes=3,
     dt_s=0.1,
 )
-CONFIG = CompactConfig(width=24, heads=4, layers=1, decoder_layers=2, dropout=0.1)
+CONFIG = CompactConfig(width=24, hidden=40, heads=4, layers=2, dropout=0.1)
 CONTRACT = SCENE.contract("test", "0.0.0")
 SCENES = named_scenes(CONTRACT)
 SOMEWHERE = Pose2(5.0, 5.0, 0.3)
@@ -219,8 +219,8 @@ def test_gradients_are_finite_whatever_is_masked(steps: int) -> None:
 
 def test_the_rotation_turns_the_heading_onto_x() -> None:
     heading = torch.tensor([[0.6, 0.8], [-1.0, 0.0]])
-    turned = heading.unsqueeze(1) @ canonical_from_tile(heading)
-    torch.testing.assert_close(turned[:, 0], torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
+    turned = canonical_from_tile(heading) @ heading.unsqueeze(-1)
+    torch.testing.assert_close(turned[..., 0], torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
 
 
 def test_the_printed_sign_of_the_rotation_would_not_be_invariant(
@@ -231,7 +231,7 @@ def test_the_printed_sign_of_the_rotation_would_not_be_invariant(
     def printed(heading: Tensor) -> Tensor:
         return canonical_from_tile(heading).transpose(-1, -2)
 
-    monkeypatch.setattr("eqrt.training.networks.compact.canonical_from_tile", printed)
+    monkeypatch.setattr("eqrt.training.networks.target_view.canonical_from_tile", printed)
     scene, pose = in_double(SCENES["driving"]), Pose2(3.0, 4.0, 1.0)
     before, _ = predict(model, scene)
     after, _ = predict(model, move_exactly(scene, pose))
@@ -365,8 +365,8 @@ def test_a_choice_that_there_is_not_is_named(setting: dict[str, Any], said: str)
 
 def test_a_configuration_from_before_the_choices_means_what_it_meant() -> None:
     tables = ModelConfig(scene=SCENE, kind="compact", network=CONFIG).to_tables()
-    old = {name: tables["network"][name] for name in ("kind", "width", "heads", "layers")}
-    old |= {"decoder_layers": 2, "dropout": 0.1}
+    old = {name: tables["network"][name] for name in ("kind", "width", "hidden", "heads")}
+    old |= {"layers": 2, "dropout": 0.1}
     assert set(tables["network"]) - set(old) == {"heading", "frame", "tokens", "uncertainty"}
     assert ModelConfig.from_tables(tables["scene"], old).network == CONFIG
     del old["width"]

@@ -232,9 +232,9 @@ def test_the_centre_counts_only_agents_that_exist() -> None:
 
 def facing(name: str, scene: Scene, heading: tuple[float, float] = (0.0, 0.0)) -> Tensor:
     """Which way the target is taken to face: the x axis of its frame, in the tile's axes."""
-    frame = TargetFrame("rotated", name, SCENE.dt_s)
+    frame = TargetFrame("rotated", name, SCENE.dt_s, SCENE.centerline_points)
     history, valid = torch.from_numpy(scene.history), torch.from_numpy(scene.history_valid)
-    seen = frame.see(
+    seen = frame(
         torch.where(valid[..., None], history, 0.0)[:, 0],
         valid[:, 0],
         torch.tensor([heading]),

@@ -8,6 +8,7 @@ import re
 import warnings
 
 import onnx
+import onnxscript.optimizer
 import torch
 from torch import nn
 
@@ -19,6 +20,7 @@ IR_VERSION = 8
 """What onnxruntime 1.15 and its contemporaries read."""
 FORBIDDEN_OPS = {"Atan2", "Einsum", "IsInf", "NonZero", "Reciprocal"}
 """Missing or slow in at least one runtime that the artifact must load in."""
+_FOLD_BYTES = 2**28
 _TRACE_BATCH = 3  # any size above 1: 1 would be taken for a constant
 
 
@@ -61,6 +63,10 @@ def _export(model: nn.Module, contract: ModelContract) -> onnx.ModelProto:
         )
     if program is None:
         raise EqrtError("the exporter returned nothing")
+    # What depends on weights alone is computed here, once, however large: networks fold by it.
+    onnxscript.optimizer.optimize(
+        program.model, input_size_limit=_FOLD_BYTES, output_size_limit=_FOLD_BYTES
+    )
     return program.model_proto
 
 

@@ -9,20 +9,20 @@ No angle is ever formed: with the unit heading u, the rotation is [[u_x, u_y], [
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 CRAWL_M = 0.3
 """Motion below this (per second) is sensor noise: it says nothing about heading."""
 DRIVE_M = 1.2
 """Motion above this defines the heading alone. Between the two, the sources are mixed."""
-NEAR_M = 1.0
-"""Scale of 'nearest' when lane directions are averaged around a standing target."""
+CRAWL_SHARE = 0.01
+"""What the slightest motion counts beside them: with nothing else, it must do."""
 _TINY = 1e-3
-"""A millimetre, where lengths meet zero. Its square must stay well above 1e-8: the ONNX exporter's
-optimiser takes an added constant below that for zero and drops it."""
+"""A millimetre, where lengths meet zero. Constants below 1e-8 are not safe: the ONNX exporter's
+optimiser takes an added one for zero and drops it."""
+_MASKED = 1e9  # a finite infinity: a softmax over nothing must not become NaN
 
 
 def exact(like: Tensor) -> AbstractContextManager[object]:
@@ -53,68 +53,58 @@ def last_valid(history: Tensor, valid: Tensor) -> Tensor:
 
 def unit(vectors: Tensor) -> Tensor:
     """Vectors (..., 2) at length 1; one shorter than a millimetre fades to 0."""
-    return vectors / (vectors.square().sum(-1, keepdim=True) + _TINY**2).sqrt()
+    return vectors / length(vectors).clamp(min=_TINY)
 
 
-@dataclass(frozen=True, slots=True)
-class LaneDirections:
-    """Which way the lanes around the targets lead; P points of all centerlines."""
-
-    directions: Tensor
-    """(B, P, 2) unit vectors."""
-    distance2: Tensor
-    """(B, P) squared distance of each point to the target, square metres."""
-    valid: Tensor
-    """(B, P) where there is a direction."""
+def length(vectors: Tensor) -> Tensor:
+    """Lengths (..., 1) of vectors (..., 2)."""
+    return torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
 
 
-def lane_directions(points: Tensor, valid: Tensor, unit_m: float) -> LaneDirections:
-    """Of centerlines (B, Q, L, 2) relative to the targets, in units of `unit_m` metres.
+class LaneDirection(nn.Module):
+    """Which way the lanes nearest to each target lead (no weights)."""
 
-    valid (B, Q, L): which points exist; the others are 0.
-    """
-    directions, defined = point_directions(points, valid)
-    return LaneDirections(
-        directions=directions.flatten(1, 2),
-        distance2=points.square().sum(-1).flatten(1) * unit_m**2,
-        valid=(valid & defined).flatten(1),
-    )
+    both: Tensor
+    """(L, L): adds each point and the next; the last one has none."""
+    onward: Tensor
+    """(L, L): from each point to the next, likewise."""
+
+    def __init__(self, centerline_points: int) -> None:
+        super().__init__()
+        here = torch.diag(torch.tensor([1.0] * (centerline_points - 1) + [0.0]))
+        after = torch.diag(torch.ones(centerline_points - 1), -1)
+        self.register_buffer("both", here + after, persistent=False)
+        self.register_buffer("onward", after - here, persistent=False)
+
+    def forward(self, points: Tensor, valid: Tensor) -> Tensor:
+        """The unit vector (B, 2); (0, 0) without any lane.
+
+        points (B, 2, Q, L): metres from the target, in its tile's axes, 0 where not valid; valid
+        (B, 1, Q, L): 1 or 0. A lane's points are about evenly spaced, so steps need no other weight
+        than nearness.
+        """
+        both = (valid @ self.both - 1.0).relu()
+        step = (points @ self.onward) * both
+        distance2 = (points * points).sum(1, keepdim=True)
+        score = (both - 1.0) * _MASKED - distance2  # d metres away weighs exp(-d^2)
+        near = score.flatten(1).softmax(-1)  # (B, P)
+        return unit((step.flatten(2) @ near.unsqueeze(-1)).squeeze(-1))
 
 
-def heading_vector(moved: Tensor, heading: Tensor, lanes: LaneDirections) -> Tensor:
+def heading_vector(moved: Tensor, heading: Tensor, lane: Tensor) -> Tensor:
     """The unit heading (B, 2) of the targets; (0, 0) where nothing defines one.
 
-    moved (B, 2): displacement over the last second, metres. heading (B, 2): measured, or 0.
+    moved (B, 2): displacement over the last second, metres. heading (B, 2): measured, or 0. lane
+    (B, 2): `LaneDirection`.
     """
-    nearest = (-lanes.distance2 / (2 * NEAR_M**2)).masked_fill(~lanes.valid, -1e9).softmax(-1)
-    lane = unit((lanes.directions * (nearest * lanes.valid).unsqueeze(-1)).sum(-2))
-    measured = heading.square().sum(-1, keepdim=True).clamp(max=1.0)
-    standing = measured * unit(heading) + (1.0 - measured) * lane
-    length = (moved.square().sum(-1, keepdim=True) + _TINY**2).sqrt()
-    motion = ((length - CRAWL_M) / (DRIVE_M - CRAWL_M)).clamp(0.0, 1.0)
-    alone = 1.0 - standing.square().sum(-1, keepdim=True).clamp(max=1.0)
-    weight = torch.maximum(motion, alone)  # with nothing else, the slightest motion must do
-    return unit(weight * unit(moved) + (1.0 - weight) * standing)
+    standing = heading + (1.0 - length(heading)) * lane
+    far = length(moved)
+    weight = ((far - CRAWL_M) / (DRIVE_M - CRAWL_M)).clamp(CRAWL_SHARE, 1.0)
+    return unit(weight * moved / far.clamp(min=_TINY) + (1.0 - weight) * standing)
 
 
 def canonical_from_tile(heading: Tensor) -> Tensor:
-    """The rotation (B, 2, 2) that turns the unit heading (B, 2) onto +x, for row vectors: p @ R."""
-    x, y = heading[..., 0], heading[..., 1]
-    return torch.stack([torch.stack([x, -y], -1), torch.stack([y, x], -1)], -2)
-
-
-def point_directions(centerlines: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit direction (B, Q, L, 2) of the lane at each point, and where it is defined (B, Q, L).
-
-    To the next point; at a line's last valid point, from the previous one.
-    """
-    step = centerlines[..., 1:, :] - centerlines[..., :-1, :]
-    step_valid = valid[..., 1:] & valid[..., :-1]
-    step = torch.where(step_valid.unsqueeze(-1), step, torch.zeros_like(step))
-    step = unit(step)
-    none = torch.zeros_like(step[..., :1, :])
-    forward = torch.cat([step, none], -2)
-    backward = torch.cat([none, step], -2)
-    has_forward = torch.cat([step_valid, torch.zeros_like(step_valid[..., :1])], -1)
-    has_backward = torch.cat([torch.zeros_like(step_valid[..., :1]), step_valid], -1)
-    return torch.where(has_forward.unsqueeze(-1), forward, backward), has_forward | has_backward
+    """The rotation (B, 2, 2) that turns the unit heading (B, 2) onto +x, for columns: R @ p."""
+    # (x, y) -> [[x, y], [-y, x]]
+    parts = [[1.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]]
+    return (heading @ heading.new_tensor(parts)).view(-1, 2, 2)

@@ -1,8 +1,8 @@
 """Our own predictor: few wide layers over one token per agent and one per centerline.
 
     history ------> the target's frame --> agent tokens --+
-                                                          +--> transformer --> K mode queries
-    centerlines --> the target's frame --> lane tokens  --+          --> trajectories, turned back
+                                                          +--> K mode queries --> trajectories,
+    centerlines --> the target's frame --> lane tokens  --+    layer by layer     turned back
 
 The paper's idea, taken to its end: not only the map but everything is read in the target's own
 frame, which turns with the world (`canonical.heading_vector`); so every feature is invariant, and a
@@ -13,6 +13,9 @@ and is predicted to stay on its course.
 What each choice is worth is measured by taking the other one: how the heading is read, whether
 anything is turned at all, and what a token of the map is. With `uncertainty` the network also says
 how far off it may be (`eqrt.training.networks.spread`).
+
+It is written for the exported graph, whose cost on a CPU is one operator after the other: products
+of two matrices wherever possible, and no more of them than needed.
 """
 
 from __future__ import annotations
@@ -22,31 +25,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from eqrt.training.networks.canonical import (
-    LaneDirections,
-    canonical_from_tile,
-    exact,
-    heading_vector,
-    lane_directions,
-    last_valid,
-    masked,
-)
-from eqrt.training.networks.config import UNIT_M, SceneConfig
+from eqrt.training.networks.canonical import exact
+from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.layers import mlp
-from eqrt.training.networks.motion import COURSE, SLOPE_STEPS, MotionFit, fitted_vectors
+from eqrt.training.networks.motion import SLOPE_STEPS
 from eqrt.training.networks.spread import SpreadDecoder, tile_covariances
-from eqrt.training.networks.target_frame import (
-    FRAMES,
-    HEADINGS,
-    check_choice,
-    one_step_heading,
-    upright,
-)
+from eqrt.training.networks.target_frame import FRAMES, HEADINGS, check_choice
+from eqrt.training.networks.target_view import TOKENS, TargetView
 from eqrt.training.networks.time_basis import BASIS, time_basis
 
-TOKENS = ("line", "point")
-"""What a token of the map is."""
-_MASKED = -1e9  # a finite minus infinity: a row without any valid token must not become NaN
+_MASKED = 1e9  # a finite infinity: a row without any valid token must not become NaN
+_SCALE_M = 10.0  # what is drawn is in tens of metres, so that weights are about 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,11 +44,12 @@ class CompactConfig:
 
     width: int
     """Of a token."""
+    hidden: int
+    """Of the perceptrons."""
     heads: int
+    """Ways in which a mode looks at the tokens at once."""
     layers: int
-    """Transformer layers over all tokens."""
-    decoder_layers: int
-    """Layers in which the modes look at the tokens."""
+    """In each of which every mode looks at all tokens."""
     dropout: float
     """Share of updates dropped while training."""
     heading: str = "robust"
@@ -84,17 +74,10 @@ class CompactPredictor(nn.Module):
 
     def __init__(self, scene: SceneConfig, config: CompactConfig) -> None:
         super().__init__()
-        width = config.width
-        self.heading, self.frame, self.tokens = config.heading, config.frame, config.tokens
-        self.motion = MotionFit(scene)
-        seen = 2 + 2 * fitted_vectors(scene) + scene.history_steps
-        self.agent = mlp([seen, 2 * width, width])
-        of_lane = 3 * scene.centerline_points if config.tokens == "line" else 4
-        self.lane = mlp([of_lane, 2 * width, width])
-        self.norm = nn.LayerNorm(width)
-        self.layers = nn.ModuleList(
-            TokenLayer(width, config.heads, config.dropout) for _ in range(config.layers)
-        )
+        self.view = TargetView(scene, config.heading, config.frame, config.tokens)
+        self.agent = TokenEncoder(self.view.of_agent, config)
+        self.lane = TokenEncoder(self.view.of_lane, config)
+        self.norm = nn.LayerNorm(config.width)
         self.modes = ModeDecoder(scene, config)
 
     def forward(
@@ -110,115 +93,49 @@ class CompactPredictor(nn.Module):
         With uncertainty also covariances (B, K, H, 2, 2), square metres, tile frame.
         """
         with exact(history):
-            seen = self._see(history, history_valid, heading, centerlines, centerlines_valid)
-        tokens = self.norm(torch.cat([self.agent(seen.agents), self.lane(seen.lines)], 1))
-        for layer in self.layers:
-            tokens = layer(tokens, tokens, seen.valid)
-        drawn, probabilities, *factors = self.modes(tokens, seen.valid, seen.velocity)
+            seen = self.view(history, history_valid, heading, centerlines, centerlines_valid)
+        tokens = self.norm(torch.cat([self.agent(seen.agents), self.lane(seen.lanes)], 1))
+        drawn = self.modes(tokens, seen.valid)
         with exact(history):
-            turned_back = drawn @ seen.canonical.transpose(-1, -2).unsqueeze(1)
-            trajectories = seen.origin[:, None, None, :] + UNIT_M * turned_back
-            covariances = [tile_covariances(factor, seen.canonical) for factor in factors]
-            return trajectories, probabilities, *covariances
+            course = seen.velocity.unsqueeze(1) @ drawn.share.to(seen.velocity)  # (B, K, 2, 1)
+            shape = drawn.shape.to(course) @ seen.turn.unsqueeze(1)  # (B, K, BASIS, 2)
+            path = self.modes.basis @ torch.cat([course.transpose(-1, -2), shape], -2)
+            covariances = [tile_covariances(factor, seen.turn) for factor in drawn.factors]
+            return seen.origin + path, drawn.probabilities, *covariances
 
-    def _see(
-        self,
-        history: Tensor,
-        history_valid: Tensor,
-        heading: Tensor,
-        centerlines: Tensor,
-        centerlines_valid: Tensor,
-    ) -> _Seen:
-        """The contract's inputs, from the target's own frame."""
-        history = masked(history, history_valid)
-        last = last_valid(history, history_valid)  # (B, N, 2)
-        origin = last[:, 0]
-        motion = self.motion(history, history_valid, last)
-        points = masked((centerlines - origin[:, None, None, :]) / UNIT_M, centerlines_valid)
-        lanes = lane_directions(points, centerlines_valid, UNIT_M)
-        if self.frame == "translated":
-            canonical = upright(origin)
-        elif self.heading == "one_step":
-            facing = one_step_heading(history[:, 0], history_valid[:, 0], heading, lanes)
-            canonical = canonical_from_tile(facing)
-        else:
-            moved = motion.velocity[:, 0, :, COURSE] * UNIT_M
-            canonical = canonical_from_tile(heading_vector(moved, heading, lanes))
-        turn = canonical.transpose(-1, -2).unsqueeze(1)  # (B, 1, 2, 2), for columns
 
-        exists = history_valid.any(-1)  # (B, N)
-        place = masked((last - origin.unsqueeze(1)) / UNIT_M, exists) @ canonical
-        vectors = (turn @ motion.vectors).flatten(2)
-        lines, lines_valid = self._lines(points, centerlines_valid, lanes, canonical)
-        return _Seen(
-            origin=origin,
-            canonical=canonical,
-            agents=torch.cat([place, vectors, history_valid.to(place.dtype)], -1),
-            lines=lines,
-            valid=torch.cat([exists, lines_valid], 1),
-            velocity=turn[:, 0] @ motion.velocity[:, 0],
-        )
+class TokenEncoder(nn.Module):
+    """A perceptron from what is known of an agent, or of a lane, to its token."""
 
-    def _lines(
-        self, points: Tensor, valid: Tensor, lanes: LaneDirections, canonical: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """What is known of each token of the map, and which exist, from points (B, Q, L, 2)."""
-        if self.tokens == "point":
-            vectors = torch.cat(
-                [points.flatten(1, 2) @ canonical, lanes.directions @ canonical], -1
-            )
-            return vectors, valid.flatten(1)
-        lines = (points @ canonical.unsqueeze(1)).flatten(2)  # (B, Q, 2 L)
-        return torch.cat([lines, valid.to(lines.dtype)], -1), valid.any(-1)
+    scale: Tensor
+    """(F,) brings the numbers to about 1; folded into the weights when exported."""
+
+    def __init__(self, scale: list[float], config: CompactConfig) -> None:
+        super().__init__()
+        self.register_buffer("scale", torch.tensor(scale), persistent=False)
+        self.widen = nn.Linear(len(scale), config.hidden)
+        self.narrow = nn.Sequential(nn.SiLU(), nn.Linear(config.hidden, config.width))
+
+    def forward(self, known: Tensor) -> Tensor:
+        """(B, 1, M, F) -> (B, M, W), as products of two matrices."""
+        rows = known.flatten(0, 2)
+        wide = torch.nn.functional.linear(rows, self.widen.weight * self.scale, self.widen.bias)
+        tokens: Tensor = self.narrow(wide)
+        return tokens.view(-1, known.shape[2], tokens.shape[-1])
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """A scene as the target sees it; only `origin` and `canonical` know where that is."""
+class Drawn:
+    """K modes of each target, the most probable first."""
 
-    origin: Tensor
-    """(B, 2) the target now, tile frame."""
-    canonical: Tensor
-    """(B, 2, 2) turns into the target's frame, for row vectors."""
-    agents: Tensor
-    """(B, N, .) where each agent is, how it moved, and when it was seen."""
-    lines: Tensor
-    """(B, Q, 3 L) the points of each centerline, and which exist; or (B, Q L, 4) each point, and
-    which way its line leads there."""
-    valid: Tensor
-    """(B, N + Q) or (B, N + Q L): which agents, lines or points exist."""
-    velocity: Tensor
-    """(B, 2, S) the target's fitted velocities."""
-
-
-class TokenLayer(nn.Module):
-    """Attention and a perceptron, each added to what was there (pre-norm)."""
-
-    def __init__(self, width: int, heads: int, dropout: float) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm1 = nn.LayerNorm(width)
-        self.query = nn.Linear(width, width)
-        self.key_value = nn.Linear(width, 2 * width)
-        self.project = nn.Linear(width, width)
-        self.norm2 = nn.LayerNorm(width)
-        self.perceptron = mlp([width, 2 * width, width])
-        self.dropout = nn.Dropout(dropout)
-
-    def forward(self, tokens: Tensor, seen: Tensor, valid: Tensor) -> Tensor:
-        """Tokens (B, M, W) that look at the tokens seen (B, S, W), valid (B, S)."""
-        query = self._split(self.query(self.norm1(tokens)))
-        key, value = self.key_value(self.norm1(seen)).chunk(2, -1)
-        hidden = (~valid[:, None, None, :]).to(tokens.dtype) * _MASKED
-        score = query @ self._split(key).transpose(-1, -2) / query.shape[-1] ** 0.5
-        attended = ((score + hidden).softmax(-1) @ self._split(value)).transpose(1, 2).flatten(2)
-        tokens = tokens + self.dropout(self.project(attended))
-        updated: Tensor = tokens + self.dropout(self.perceptron(self.norm2(tokens)))
-        return updated
-
-    def _split(self, tokens: Tensor) -> Tensor:
-        batch, count, _ = tokens.shape
-        return tokens.view(batch, count, self.heads, -1).transpose(1, 2)  # (B, heads, M, W / heads)
+    probabilities: Tensor
+    """(B, K)"""
+    share: Tensor
+    """(B, K, S, 1) of each fitted velocity in the mode's course."""
+    shape: Tensor
+    """(B, K, BASIS, 2) how the mode leaves its course, in the target's frame."""
+    factors: tuple[Tensor, ...]
+    """With uncertainty, (B, K, H, 2, 2) of `spread`, in the target's frame; else empty."""
 
 
 class ModeDecoder(nn.Module):
@@ -228,53 +145,112 @@ class ModeDecoder(nn.Module):
     functions of time that are 0 now. With uncertainty, each mode also draws its spread.
     """
 
-    time: Tensor
-    """(H,) seconds."""
     basis: Tensor
-    """(BASIS, H)"""
+    """(H, 1 + BASIS) metres: what a velocity of 1 m/s, and each drawn number, adds at each step."""
 
     def __init__(self, scene: SceneConfig, config: CompactConfig) -> None:
         super().__init__()
         width = config.width
         self.num_modes, self.steps = scene.num_modes, scene.horizon_steps
         self.query = nn.Parameter(0.5 * torch.randn(scene.num_modes, width))
-        self.layers = nn.ModuleList(
-            TokenLayer(width, config.heads, config.dropout) for _ in range(config.decoder_layers)
-        )
+        self.layers = nn.ModuleList(ModeLayer(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(width)
-        self.draw = mlp([width, 2 * width, 2 * BASIS + len(SLOPE_STEPS)])
+        self.draw = mlp([width, config.hidden, 2 * BASIS + len(SLOPE_STEPS)])
         with torch.no_grad():
             list(self.draw.parameters())[-2].mul_(0.1)  # training starts near the mean course
-        self.logit = mlp([width, width, 1])
+        self.logit = mlp([width, width, 1]) if scene.num_modes > 1 else None
         time = torch.arange(1, self.steps + 1) * scene.dt_s
-        self.register_buffer("time", time, persistent=False)
-        self.register_buffer("basis", time_basis(self.steps), persistent=False)
+        basis = torch.cat([time.unsqueeze(0), _SCALE_M * time_basis(self.steps)])
+        self.register_buffer("basis", basis.T.contiguous(), persistent=False)
         spread = SpreadDecoder(width, self.steps, scene.dt_s) if config.uncertainty else None
         self.spread = spread  # last, so that all other weights start as they would without
 
-    def forward(self, tokens: Tensor, valid: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
-        """Tokens (B, M, W), the target's first; valid (B, M); its velocity (B, 2, S).
-
-        Returns (B, K, H, 2), relative to the target, in its frame, network units, and (B, K); the
-        most probable mode first. With uncertainty also the factors (B, K, H, 2, 2) of `spread`.
-        """
-        queries = tokens[:, :1] + self.query
+    def forward(self, tokens: Tensor, valid: Tensor) -> Drawn:
+        """Tokens (B, M, W), the target's first; valid (B, 1, M) 1 or 0."""
+        hidden = (valid - 1.0) * _MASKED
+        columns = tokens.transpose(1, 2)
+        queries = (tokens[:, :1] + self.query).flatten(0, 1)  # (B K, W)
         for layer in self.layers:
-            queries = layer(queries, tokens, valid)
-        queries = self.norm(queries)  # (B, K, W)
-        probabilities = self.logit(queries).squeeze(-1).softmax(-1)
-        drawn = self.draw(queries).to(velocity.dtype)
-        with exact(velocity):
-            share = drawn[..., 2 * BASIS :].softmax(-1)  # (B, K, S)
-            course = (share @ velocity.transpose(-1, -2)).unsqueeze(-2) * self.time.unsqueeze(-1)
-            shape = drawn[..., : 2 * BASIS].unflatten(-1, (2, BASIS)) @ self.basis  # (B, K, 2, H)
-            trajectories = course + shape.transpose(-1, -2)
-        factors = () if self.spread is None else (self.spread(queries),)
-        if self.num_modes == 1:
-            return trajectories, probabilities, *factors
-        probabilities, order = probabilities.topk(self.num_modes, dim=-1)
-        places = order[..., None, None].expand(-1, -1, self.steps, 2)
-        ordered = [
-            factor.gather(1, places.unsqueeze(-1).expand(-1, -1, -1, -1, 2)) for factor in factors
-        ]
-        return trajectories.gather(1, places), probabilities, *ordered
+            queries = layer(queries, tokens, columns, hidden)
+        queries = self.norm(queries)
+        shape, share = self.draw(queries).split([2 * BASIS, len(SLOPE_STEPS)], -1)
+        factors = () if self.spread is None else (self.spread(self._by_mode(queries)),)
+        return self._sorted(
+            queries,
+            share.softmax(-1).view(-1, self.num_modes, len(SLOPE_STEPS), 1),
+            shape.reshape(-1, self.num_modes, BASIS, 2),
+            factors,
+        )
+
+    def _by_mode(self, values: Tensor) -> Tensor:
+        """(B K, F) -> (B, K, F)."""
+        return values.view(-1, self.num_modes, values.shape[-1])
+
+    def _sorted(
+        self, queries: Tensor, share: Tensor, shape: Tensor, factors: tuple[Tensor, ...]
+    ) -> Drawn:
+        if self.logit is None:
+            certain = queries[:, :1].softmax(-1)  # of one: 1
+            return Drawn(certain, share, shape, factors)
+        logits = self._by_mode(self.logit(queries)).squeeze(-1)
+        probabilities, order = logits.softmax(-1).topk(self.num_modes, dim=-1)
+
+        def sort(values: Tensor) -> Tensor:
+            places = order.view(*order.shape, *[1] * (values.dim() - 2))
+            return values.gather(1, places.expand(-1, -1, *values.shape[2:]))
+
+        return Drawn(probabilities, sort(share), sort(shape), tuple(map(sort, factors)))
+
+
+class ModeLayer(nn.Module):
+    """Attention of the modes to the tokens, and a perceptron, each added to what was there.
+
+    It is the usual attention, multiplied out for few queries, often one, and many tokens: a key's
+    product with a query is the token's product with a row of W, and what a head returns is a mean of
+    tokens. So keys and values are never computed; their weights are folded into those before and
+    after, once, when the network is exported.
+    """
+
+    def __init__(self, config: CompactConfig) -> None:
+        super().__init__()
+        self.heads, width = config.heads, config.width
+        self.norm1 = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width, bias=False)  # one would change no share
+        self.value = nn.Linear(width, width, bias=False)
+        self.project = nn.Linear(width, width, bias=False)
+        self.norm2 = nn.LayerNorm(width)
+        self.widen = nn.Sequential(nn.Linear(width, config.hidden), nn.SiLU())
+        self.narrow = nn.Linear(config.hidden, width, bias=False)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, queries: Tensor, tokens: Tensor, columns: Tensor, hidden: Tensor) -> Tensor:
+        """Queries (B K, W) that look at tokens (B, M, W), also given as columns (B, W, M).
+
+        hidden (B, 1, M): 0, or minus infinity where there is no token.
+        """
+        batch, _, width = tokens.shape
+        ask, ask_bias, tell = self._folded()
+        asked = torch.nn.functional.linear(self.norm1(queries), ask, ask_bias)
+        share = (asked.view(batch, -1, width) @ columns + hidden).softmax(-1)  # (B, K heads, M)
+        answer = (share @ tokens).view(-1, self.heads * width)
+        queries = self._add(queries, answer, tell)
+        return self._add(queries, self.widen(self.norm2(queries)), self.narrow.weight.T)
+
+    def _folded(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Weights (heads W, W) and bias (heads W,) of what is asked; (heads W, W) of the answer."""
+        width = self.query.weight.shape[0]
+        by_head = (self.heads, -1, width)
+        key = self.key.weight.view(by_head).transpose(-1, -2) / (width / self.heads) ** 0.5
+        ask = key @ self.query.weight.view(by_head)  # (heads, W, W)
+        bias = key @ self.query.bias.view(self.heads, -1, 1)
+        value = self.value.weight.view(by_head).transpose(-1, -2)
+        tell = value @ self.project.weight.T.reshape(by_head)
+        return ask.flatten(0, 1), bias.flatten(), tell.flatten(0, 1)
+
+    def _add(self, to: Tensor, values: Tensor, weight: Tensor) -> Tensor:
+        """A linear function of `values` on top: one operator in the exported graph."""
+        if self.training:
+            dropped: Tensor = to + self.dropout(values @ weight)
+            return dropped
+        return torch.addmm(to, values, weight)

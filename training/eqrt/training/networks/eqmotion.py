@@ -78,7 +78,7 @@ class EqMotion(nn.Module):
         super().__init__()
         width, depth = config.hidden, config.mlp_layers
         self.modes, self.steps = scene.num_modes, scene.horizon_steps
-        self.frame = TargetFrame(config.frame, config.heading, scene.dt_s)
+        self.frame = TargetFrame(config.frame, config.heading, scene.dt_s, scene.centerline_points)
         self.in_metres = config.map == "raster"
         self.map = map_encoder(scene, config)
         self.fusion = None if self.map is None else MapFusion(width)
@@ -105,7 +105,7 @@ class EqMotion(nn.Module):
         origin = last[:, :1]  # (B, 1, 1, 2) the target, now
         held = torch.where(history_valid.unsqueeze(-1), history, last)
         agents = Agents.of(history_valid, history.dtype)
-        map_points = self.frame.see(
+        map_points = self.frame(
             history[:, 0], history_valid[:, 0], heading, centerlines, centerlines_valid
         )
         from_map, vectors = self.read_map(map_points)

@@ -62,16 +62,16 @@ class SpreadDecoder(nn.Module):
             return torch.stack(rows, -2)
 
 
-def tile_covariances(factor: Tensor, canonical: Tensor) -> Tensor:
+def tile_covariances(factor: Tensor, turn: Tensor) -> Tensor:
     """Covariances (B, K, H, 2, 2), square metres, in the tile's axes.
 
-    Of factors (B, K, H, 2, 2) in the target's frame, which `canonical` (B, 2, 2) turns into (row
-    vectors). A target without any direction has the zero matrix there: its spread is a circle, the
+    Of factors (B, K, H, 2, 2) in the target's frame, which `turn` (B, 2, 2) turns columns into. A
+    target without any direction has the zero matrix there: its spread is a circle, the
     only shape that is the same whichever way the world is turned.
     """
-    turned = canonical[:, None, None] @ factor
+    turned = turn.transpose(-1, -2)[:, None, None] @ factor
     shape = turned @ turned.transpose(-1, -2)
-    direction2 = canonical[:, 0].square().sum(-1)  # (B,) 1, or 0 without any
+    direction2 = turn[:, 0].square().sum(-1)  # (B,) 1, or 0 without any
     missing = (1.0 - direction2).clamp(min=0.0)[:, None, None]
     mean = 0.5 * missing * factor.square().sum((-1, -2))  # (B, K, H)
     circle = mean[..., None, None] * torch.eye(2, dtype=factor.dtype, device=factor.device)

@@ -11,14 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from eqrt.training.networks.canonical import (
-    LaneDirections,
+    LaneDirection,
     canonical_from_tile,
     heading_vector,
-    lane_directions,
     last_valid,
+    length,
     masked,
     unit,
 )
@@ -46,18 +46,20 @@ class MapPoints:
     """(B, 2, 2): turns vectors (B, 2, C) of the chosen frame back into the tile's axes."""
 
 
-class TargetFrame:
+class TargetFrame(nn.Module):
     """Brings centerlines into the target's frame. Has no weights."""
 
-    def __init__(self, frame: str, heading: str, dt_s: float) -> None:
+    def __init__(self, frame: str, heading: str, dt_s: float, centerline_points: int) -> None:
         """Raise ValueError for a choice that is not in FRAMES, HEADINGS."""
+        super().__init__()
         check_choice("frame", frame, FRAMES)
         check_choice("heading", heading, HEADINGS)
         self.rotated = frame == "rotated"
         self.robust = heading == "robust"
         self.dt_s = dt_s
+        self.lane_direction = LaneDirection(centerline_points)
 
-    def see(
+    def forward(
         self,
         history: Tensor,
         history_valid: Tensor,
@@ -67,23 +69,24 @@ class TargetFrame:
     ) -> MapPoints:
         """The target's masked history (B, T, 2), and the contract's inputs for the map."""
         origin = last_valid(history, history_valid)  # (B, 2)
-        points = masked(centerlines - origin[:, None, None, :], centerlines_valid) / UNIT_M
+        points = masked(centerlines - origin[:, None, None, :], centerlines_valid)
         if not self.rotated:
-            return MapPoints(points, centerlines_valid, upright(origin))
+            return MapPoints(points / UNIT_M, centerlines_valid, upright(origin))
         facing = self._facing(history, history_valid, heading, points, centerlines_valid)
-        turn = canonical_from_tile(facing)
-        turned = points.flatten(1, 2) @ turn
-        return MapPoints(turned.view_as(points), centerlines_valid, turn)
+        tile_from_frame = canonical_from_tile(facing).transpose(-1, -2)
+        turned = points.flatten(1, 2) @ tile_from_frame  # rows: turned by its transpose
+        return MapPoints(turned.view_as(points) / UNIT_M, centerlines_valid, tile_from_frame)
 
     def _facing(
         self, history: Tensor, valid: Tensor, heading: Tensor, points: Tensor, points_valid: Tensor
     ) -> Tensor:
-        """The unit heading (B, 2); (0, 0) where nothing defines one."""
-        lanes = lane_directions(points, points_valid, UNIT_M)
+        """The unit heading (B, 2); (0, 0) where nothing defines one. Points in metres."""
+        valid_here = points_valid.unsqueeze(1).to(points.dtype)
+        lane = self.lane_direction(points.permute(0, 3, 1, 2), valid_here)
         if self.robust:
             moved = fitted_velocity(history, valid, self.dt_s)  # metres in one second
-            return heading_vector(moved, heading, lanes)
-        return one_step_heading(history, valid, heading, lanes)
+            return heading_vector(moved, heading, lane)
+        return one_step_heading(history, valid, heading, lane)
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -98,17 +101,15 @@ def upright(origin: Tensor) -> Tensor:
     return identity.expand(origin.shape[0], 2, 2)
 
 
-def one_step_heading(
-    history: Tensor, valid: Tensor, heading: Tensor, lanes: LaneDirections
-) -> Tensor:
+def one_step_heading(history: Tensor, valid: Tensor, heading: Tensor, lane: Tensor) -> Tensor:
     """The unit heading (B, 2) of the paper; (0, 0) where nothing defines one.
 
-    The target's masked history (B, T, 2) in metres, valid (B, T), measured heading (B, 2) or 0.
+    The target's masked history (B, T, 2) in metres, valid (B, T), measured heading (B, 2) or 0,
+    lane (B, 2): `canonical.LaneDirection`.
     """
     step = last_step(history, valid)
-    standing = heading_vector(torch.zeros_like(step), heading, lanes)
-    moves = step.square().sum(-1, keepdim=True) > STILL_M**2
-    return torch.where(moves, unit(step), standing)
+    standing = heading_vector(torch.zeros_like(step), heading, lane)
+    return torch.where(length(step) > STILL_M, unit(step), standing)
 
 
 def last_step(history: Tensor, valid: Tensor) -> Tensor:
