@@ -432,6 +432,7 @@ def test_covariances_come_in_the_order_of_their_modes(
     """Without probabilities that differ, modes stay as they are drawn: the same pairs are there."""
     model, scene = variants["uncertain"], SCENES["driving"]
     sorted_modes = outputs(model, scene)
+    assert model.modes.logit is not None
     with torch.no_grad():
         last = list(model.modes.logit.parameters())[-2]
         monkeypatch.setattr(last, "data", -last.data)  # the least probable first
