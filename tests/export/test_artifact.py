@@ -398,6 +398,6 @@ def test_a_failed_export_leaves_the_old_artifact_alone(
     before = (copy / "SHA256SUMS").read_bytes()
     monkeypatch.setattr("eqrt.export.artifact.AGREEMENT_M", -1.0)  # nothing agrees that well
     with pytest.raises(EqrtError, match="differ"):
-        write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy)
+        write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy, "Other weights.")
     assert (copy / "SHA256SUMS").read_bytes() == before
     assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]
