@@ -14,6 +14,7 @@ assert _spec.loader is not None
 _module = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(_module)
 
+compare = _module.compare
 main = _module.main
 pack = _module.pack
 read_contract = _module.read_contract

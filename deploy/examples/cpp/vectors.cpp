@@ -104,7 +104,8 @@ struct Comparison {
 // Modes that are as probable as each other may change places.
 Comparison compare(const Outputs& found, const Outputs& expected) {
   for (size_t i = 0; i < expected.size(); ++i) {
-    if (found[i].get_shape() != expected[i].get_shape() || !finite(found[i])) {
+    if (found[i].get_shape() != expected[i].get_shape() || !finite(found[i]) ||
+        !finite(expected[i])) {
       return {std::numeric_limits<double>::infinity(), false};
     }
   }

@@ -72,7 +72,7 @@ function draw(scene, targets) {
     const now = scene.agents[agent].at(-1);
     line([now, ...future], TRUTH, 6);
     for (const { places, share } of [...modes].reverse()) {
-      line([now, ...places], PREDICTION, 6, { dash: [14, 8], alpha: 0.3 + 0.7 * share });
+      line([now, ...places], PREDICTION, 6, { dash: [14, 8], alpha: 0.2 + (0.8 * share) / modes[0].share });
     }
   }
   pen.globalAlpha = 1;

@@ -46,7 +46,7 @@ def load_onnxruntime(artifact: Path) -> Run:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # small models gain nothing from more
     session = onnxruntime.InferenceSession(
-        artifact / "model.onnx", options, providers=["CPUExecutionProvider"]
+        str(artifact / "model.onnx"), options, providers=["CPUExecutionProvider"]
     )
     names = list(read_contract(artifact)["outputs"])
     return lambda inputs: session.run(names, dict(inputs))
@@ -199,7 +199,7 @@ def compare(found: Sequence[Array], expected: Sequence[Array]) -> tuple[float, b
     """
     if [a.shape for a in found] != [b.shape for b in expected]:
         return np.inf, False
-    if not all(np.isfinite(a).all() for a in found):
+    if not all(np.isfinite(a).all() for a in [*found, *expected]):
         return np.inf, False
     worst, good = 0.0, True
     for b, shares in enumerate(expected[1]):

@@ -37,7 +37,7 @@ from eqrt.runtime.replay import replay
 AT_S = 58.3  # s after the drive's start: a junction, some cars turn
 MOVING_M = 5.0  # a target drives at least so far in its future
 DT_S = 0.1
-HISTORY_STEPS, FUTURE_STEPS = 40, 30
+HISTORY_STEPS, FUTURE_STEPS = 22, 30  # this part of the drive began 2.3 s before
 AGENTS, LINES = 48, 8
 POINTS = 41  # over 100 m of a line
 ABOUT = "a junction of Lankershim Boulevard, Los Angeles (NGSIM), as eqrt's service sees it"
