@@ -12,7 +12,7 @@ PYTEST_ARGS ?= -n 2 --dist loadfile
 .PHONY: help demo test test-runtime lint conformance conformance-table bench figures clean
 
 help: ## list what can be made
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 16
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: $(RUNTIME_VENV)/.installed ## see it work: recorded traffic over CAN, predicted and scored
 	@$(RUNTIME_VENV)/bin/eqrt demo

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from conformance.environments import FOLDER
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from handmade_model import CONTRACT, sign, tensor, write_handmade
 from python_example import read_tensor
@@ -19,7 +18,7 @@ from source_tree import ROOT
 MOVED_M = 0.005
 DAMAGES = {
     "position": (0, MOVED_M),
-    "not a number": (0, np.nan),
+    "not-a-number": (0, np.nan),
     "probability": (1, 0.001),
     "covariance": (2, 0.1),
 }
@@ -32,16 +31,17 @@ def shipped() -> list[Path]:
     return [DEFAULT_ARTIFACT, *models]
 
 
-def other_sizes() -> Path:
+def other_sizes(into: Path) -> Path:
     """Another N, T, Q, L, H and K, and a third output: nothing may be made for one model."""
     contract = replace(CONTRACT, name="other-sizes", num_modes=2, covariances=True)
-    return write_handmade(_fresh("other-sizes"), contract=contract, sure=0.5)
+    return write_handmade(_fresh(into / "other-sizes"), contract=contract, sure=0.5)
 
 
-def damaged(artifact: Path, damage: str) -> Path:
+def damaged(artifact: Path, damage: str, into: Path) -> Path:
     """A copy in which one value of one test vector is wrong: every check must find it."""
     output, change = DAMAGES[damage]
-    folder = Path(shutil.copytree(artifact, _fresh(f"damaged {damage}".replace(" ", "-"))))
+    folder = _fresh(into / f"damaged-{damage}")
+    shutil.copytree(artifact, folder)
     vector = _last_vector(folder)
     values = read_tensor(vector, "output", output).copy()
     values.reshape(-1)[-1] += np.float32(change)
@@ -49,9 +49,10 @@ def damaged(artifact: Path, damage: str) -> Path:
     return folder
 
 
-def swapped(artifact: Path) -> Path:
+def swapped(artifact: Path, into: Path) -> Path:
     """A copy in which the modes of one test vector stand in another order: as good."""
-    folder = Path(shutil.copytree(artifact, _fresh("swapped")))
+    folder = _fresh(into / "swapped")
+    shutil.copytree(artifact, folder)
     vector = _last_vector(folder)
     for output in range(3):
         _write(vector, output, read_tensor(vector, "output", output)[:, ::-1])
@@ -68,8 +69,7 @@ def _write(vector: Path, output: int, values: NDArray[Any]) -> None:
     sign(vector.parent)
 
 
-def _fresh(name: str) -> Path:
-    folder = FOLDER / "artifacts" / name
+def _fresh(folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.parent.mkdir(parents=True, exist_ok=True)
     return folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
 import subprocess
 import time
 import urllib.error
@@ -36,7 +37,7 @@ class Browser:
         )
         port = next(match[1] for match in ports if match)
         self._url = f"http://127.0.0.1:{port}/session"
-        options = {"binary": "/usr/bin/chromium", "args": _OPTIONS}
+        options = {"binary": shutil.which("chromium"), "args": _OPTIONS}
         wanted = {"browserName": "chrome", "goog:chromeOptions": options}
         session = self._ask("POST", "", {"capabilities": {"alwaysMatch": wanted}})
         self._url += f"/{session['sessionId']}"

@@ -8,12 +8,13 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from source_tree import ROOT
 
 FOLDER = ROOT / ".conformance"
+Environment = Mapping[str, str]
 _INSTALL = ("install", "-qq", "--disable-pip-version-check", "--no-compile")
 
 
@@ -57,12 +58,12 @@ def need(*programs: str) -> None:
             raise MissingError(f"no {program} on this machine; .ci/run installs what is needed")
 
 
-def run(command: Sequence[str], **options: object) -> str:
-    """What a command prints. Raises CalledProcessError, which shows what it said, if it fails."""
-    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]  # passed on as they are
+def run(command: Sequence[str], cwd: Path | None = None, env: Environment | None = None) -> str:
+    """What a command prints. Raises RuntimeError with what it said if it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=env)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)}: status {done.returncode}\n{done.stderr[-2000:]}")
-    return str(done.stdout)
+    return done.stdout
 
 
 def oldest_dependencies() -> list[str]:

@@ -84,8 +84,8 @@ def test_the_oldest_versions_are_those_of_the_project() -> None:
     assert {"numpy", "onnxruntime"} <= names
 
 
-def test_the_damaged_copy_is_off_in_one_place() -> None:
-    copy = damaged(DEFAULT_ARTIFACT, "position")
+def test_the_damaged_copy_is_off_in_one_place(tmp_path: Path) -> None:
+    copy = damaged(DEFAULT_ARTIFACT, "position", tmp_path)
     moved = []
     for vector in sorted(DEFAULT_ARTIFACT.glob("test_data_set_*")):
         found = read_tensor(copy / vector.name, "output", 0)

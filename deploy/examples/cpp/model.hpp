@@ -9,4 +9,4 @@
 
 using Json = nlohmann::ordered_json;  // the contract's tensors are in order
 using Inputs = std::map<std::string, ov::Tensor>;
-using Outputs = std::vector<ov::Tensor>;  // in the contract's order: trajectories, probabilities, ...
+using Outputs = std::vector<ov::Tensor>;  // in the contract's order, trajectories first

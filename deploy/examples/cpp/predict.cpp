@@ -7,7 +7,8 @@
 #include <cmath>
 #include <cstdio>
 #include <fstream>
-#include <openvino/openvino.hpp>
+#include <openvino/runtime/core.hpp>
+#include <openvino/runtime/properties.hpp>
 #include <stdexcept>
 
 #include "scene.hpp"
@@ -24,7 +25,7 @@ Json read_json(const fs::path& path) {
 }
 
 Run load(const fs::path& artifact, const Json& contract) {
-  // Without float32 said, OpenVINO computes in bfloat16 where the CPU can: decimetres off.
+  // Without float32 said, OpenVINO computes in bfloat16 where the CPU can: metres off.
   auto model = ov::Core().compile_model((artifact / "model.onnx").string(), "CPU",
                                         ov::hint::inference_precision(ov::element::f32),
                                         ov::inference_num_threads(1));
@@ -34,7 +35,8 @@ Run load(const fs::path& artifact, const Json& contract) {
     request.infer();
     Outputs outputs;
     for (const auto& [name, spec] : contract["outputs"].items()) {
-      ov::Tensor value = request.get_tensor(name), copy(value.get_element_type(), value.get_shape());
+      const ov::Tensor value = request.get_tensor(name);
+      ov::Tensor copy(value.get_element_type(), value.get_shape());
       value.copy_to(copy);  // the request's own is overwritten by the next run
       outputs.push_back(copy);
     }

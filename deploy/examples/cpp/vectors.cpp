@@ -82,7 +82,9 @@ double difference(const ov::Tensor& found, size_t found_mode, const ov::Tensor& 
   double largest = 0.0;
   for (size_t i = 0; i < size; i += unit) {
     double scale = 1.0;
-    for (size_t j = i; unit > 1 && j < i + unit; ++j) scale = std::max<double>(scale, std::abs(theirs[j]));
+    for (size_t j = i; unit > 1 && j < i + unit; ++j) {
+      scale = std::max<double>(scale, std::abs(theirs[j]));
+    }
     for (size_t j = i; j < i + unit; ++j) {
       largest = std::max(largest, std::abs(double{mine[j]} - theirs[j]) / scale);
     }
@@ -120,7 +122,10 @@ Comparison compare(const Outputs& found, const Outputs& expected) {
       for (size_t m = b * modes; m < (b + 1) * modes; ++m) {
         if (taken[m - b * modes] || std::abs(mine[m] - theirs[k]) > kProbability) continue;
         const double here = difference(found[0], m, expected[0], k);
-        if (here < apart) mode = m, apart = here;
+        if (here < apart) {
+          mode = m;
+          apart = here;
+        }
       }
       taken[mode - b * modes] = true;
       result.good = result.good && std::isfinite(apart);
@@ -151,8 +156,10 @@ bool check(const fs::path& artifact, const Json& contract, const Run& run) {
     if (entry.path().filename().string().rfind("test_data_set_", 0) != 0) continue;
     const Outputs stored = read_all(entry, "input", contract["inputs"].size());
     Inputs inputs;
-    for (const auto& [name, spec] : contract["inputs"].items()) inputs[name] = stored[inputs.size()];
-    const auto result = compare(run(inputs), read_all(entry, "output", contract["outputs"].size()));
+    size_t index = 0;
+    for (const auto& [name, spec] : contract["inputs"].items()) inputs[name] = stored[index++];
+    const Outputs expected = read_all(entry, "output", contract["outputs"].size());
+    const Comparison result = compare(run(inputs), expected);
     all = {std::max(all.worst_m, result.worst_m), all.good && result.good};
     ++count;
   }

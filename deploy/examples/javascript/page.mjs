@@ -16,18 +16,24 @@ ort.env.wasm.numThreads = 1; // more need headers that a plain file server does 
 const artifact = new URLSearchParams(location.search).get("artifact") ?? SHIPPED;
 const read = async (path) => new Uint8Array(await (await got(`${artifact}/${path}`)).arrayBuffer());
 
-try {
+await orSayWhy(async () => {
   const contract = await (await got(`${artifact}/contract.json`)).json();
   const scene = await (await got("../scene.json")).json();
   const session = await ort.InferenceSession.create(await read("model.onnx"), { executionProviders: ["wasm"] });
   const run = (inputs) => session.run(tensors(inputs));
-  await show(scene, contract, run);
   const button = document.querySelector("#check");
-  button.onclick = async () => say("verdict", (await check(contract, read, run)).line);
+  button.onclick = () => orSayWhy(async () => say("verdict", (await check(contract, read, run)).line));
   button.disabled = false;
-} catch (error) {
-  say("error", `${error}`);
-  throw error;
+  await show(scene, contract, run);
+});
+
+async function orSayWhy(work) {
+  try {
+    await work();
+  } catch (error) {
+    say("error", `${error}`);
+    throw error;
+  }
 }
 
 async function show(scene, contract, run) {
@@ -54,7 +60,8 @@ function tensors(inputs) {
 /** Lanes, where everybody came from, the truth, and the predictions, fainter where less probable. */
 function draw(scene, targets) {
   const pen = document.querySelector("#picture").getContext("2d");
-  const { toPixel, pxPerM } = view(targets.flatMap(({ agent, future }) => [...scene.agents[agent], ...future]), pen.canvas);
+  const shown = targets.flatMap(({ agent, future }) => [...scene.agents[agent], ...future]);
+  const { toPixel, pxPerM } = view(shown, pen.canvas);
   const line = (places, color, width, { dash = [], alpha = 1 } = {}) => {
     pen.strokeStyle = color;
     pen.lineWidth = width;
@@ -72,7 +79,8 @@ function draw(scene, targets) {
     const now = scene.agents[agent].at(-1);
     line([now, ...future], TRUTH, 6);
     for (const { places, share } of [...modes].reverse()) {
-      line([now, ...places], PREDICTION, 6, { dash: [14, 8], alpha: 0.2 + (0.8 * share) / modes[0].share });
+      const alpha = 0.2 + (0.8 * share) / modes[0].share;
+      line([now, ...places], PREDICTION, 6, { dash: [14, 8], alpha });
     }
   }
   pen.globalAlpha = 1;
