@@ -17,7 +17,13 @@ from conformance.environments import need
 
 PATIENCE_S = 60.0
 _ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # how WebDriver calls a reference to an element
-_OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1050,1000")
+_OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",  # which root has not; it shows pages of this checkout only
+    "--disable-dev-shm-usage",
+    "--disable-gpu",
+    "--window-size=1050,1000",
+)
 
 
 class Browser:

@@ -4,8 +4,8 @@ One moment of the recorded drive that comes with `eqrt demo`, as the service see
 happened next. It holds more agents, steps, lines and points than a model reads, so that an example
 packs it for the sizes in a model's contract as an engineer packs tracks and lanes of their own.
 
-`agents`: every track, `history` at the last `history_steps` ticks of `dt_s` (null = not seen), the
-last one now. `targets`: whom to predict: `agent` is an index, `heading` a unit vector, [0, 0] = not
+`agents`: where every track that is seen now was at the last ticks of `dt_s` (null = not seen), the
+last one being now. `targets`: whom to predict: `agent` is an index, `heading` a unit vector, [0, 0] = not
 known; `centerlines` are the lanes that it may follow, the likeliest first, with points at equal
 distances (null = beyond the map's end); `future` is where it was at the next ticks.
 """
@@ -142,9 +142,9 @@ def _movers(then: ForecastSet, scored: list[Scored]) -> dict[int, Scored]:
 
 
 def _agents(scene: Scene) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(A, T, 2) and (A, T): everybody in any row, once, in the order of the first row."""
-    first = scene.history_valid[0].any(axis=1)
-    return scene.history[0, first], scene.history_valid[0, first]
+    """(A, T, 2) and (A, T): everybody who is seen now, in the order of the first row."""
+    now = scene.history_valid[0, :, -1]
+    return scene.history[0, now], scene.history_valid[0, now]
 
 
 def _places(points: NDArray[np.float32], valid: NDArray[np.bool_]) -> list[Any]:
