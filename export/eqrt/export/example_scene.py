@@ -5,9 +5,9 @@ happened next. It holds more agents, steps, lines and points than a model reads,
 packs it for the sizes in a model's contract as an engineer packs tracks and lanes of their own.
 
 `agents`: where every track that is seen now was at the last ticks of `dt_s` (null = not seen), the
-last one being now. `targets`: whom to predict: `agent` is an index, `heading` a unit vector, [0, 0] = not
-known; `centerlines` are the lanes that it may follow, the likeliest first, with points at equal
-distances (null = beyond the map's end); `future` is where it was at the next ticks.
+last one being now. `targets`: whom to predict: `agent` is an index, `heading` a unit vector, [0, 0]
+= not known; `centerlines` are the lanes that it may follow, the likeliest first, with points at
+equal distances (null = beyond the map's end); `future` is where it was at the next ticks.
 """
 
 from __future__ import annotations
