@@ -69,14 +69,15 @@ def test_back_to_back_with_a_budget_and_a_baseline_that_nothing_can_keep(
     assert "ANOTHER MODEL: handmade" in run.said
     assert "REGRESSION" in run.page
     measured = run.report.cases[0]
-    model, velocity, turn = measured.workloads
+    model, velocity, turn, filtered = measured.workloads
     assert [load.name for load in measured.workloads] == [
         "model",
         "constant velocity",
         "constant turn",
+        "Kalman filter",
     ]
     assert list(model.stages) == ["gather", "infer", "map frame"]
-    assert model.samples == velocity.samples == turn.samples
+    assert model.samples == velocity.samples == turn.samples == filtered.samples
     assert sum(model.histogram.counts) == model.samples
     means = [stage.mean_ns for stage in model.stages.values()]
     assert model.total.mean_ns == pytest.approx(sum(means), abs=2)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from eqrt.core.contract import ModelContract
+from eqrt.core.kalman import kalman
 from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
 from eqrt.core.scene import Scene
 from eqrt.runtime.bench.scenes import ScenePool
@@ -116,7 +117,16 @@ def _constant_turn(scene: Scene, horizon_steps: int, dt_s: float) -> Any:
     return constant_turn(now, velocity, turn_rate_rad_s, horizon_steps, dt_s) + scene.origin
 
 
-PHYSICS = {"constant velocity": _constant_velocity, "constant turn": _constant_turn}
+def _kalman(scene: Scene, horizon_steps: int, dt_s: float) -> Any:
+    history, valid = _own_history(scene)
+    return kalman(history, valid, horizon_steps, dt_s) + scene.origin
+
+
+PHYSICS = {
+    "constant velocity": _constant_velocity,
+    "constant turn": _constant_turn,
+    "Kalman filter": _kalman,
+}
 
 
 def _own_history(scene: Scene) -> tuple[Any, Any]:
