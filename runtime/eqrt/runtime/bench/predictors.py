@@ -15,12 +15,10 @@ from eqrt.core.contract import ModelContract
 from eqrt.core.kalman import kalman
 from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
 from eqrt.core.scene import Scene
+from eqrt.runtime.bench.report import MODEL
 from eqrt.runtime.bench.scenes import ScenePool
 from eqrt.runtime.bench.schedule import CLOCK, Clock
 from eqrt.runtime.prediction.predictor import Predictor
-
-MODEL = "model"
-"""The name of the workload that is judged; the others are there for comparison."""
 
 
 class TimedSession:
@@ -57,12 +55,14 @@ def load_timed(artifact: Path, threads: int) -> TimedPredictor:
 class ModelWorkload:
     """One prediction of so many targets."""
 
-    name = MODEL
     stages = ("gather", "infer", "map frame")
     """Taking the targets' inputs from the pool; running the graph; everything else that
     `Predictor.predict` does: cutting batches, joining results, going back to the map frame."""
 
-    def __init__(self, predictor: TimedPredictor, pool: ScenePool, targets: int) -> None:
+    def __init__(
+        self, predictor: TimedPredictor, pool: ScenePool, targets: int, name: str = MODEL
+    ) -> None:
+        self.name = name
         self._predictor = predictor
         self._pool = pool
         self._targets = targets
@@ -134,15 +134,7 @@ def _own_history(scene: Scene) -> tuple[Any, Any]:
     return scene.history[:, 0].astype(np.float64), scene.history_valid[:, 0]
 
 
-def workloads(
-    predictor: TimedPredictor, pool: ScenePool, targets: int
-) -> tuple[ModelWorkload | PhysicsWorkload, ...]:
-    """The model first, then physics."""
-    contract = predictor.contract
-    return (
-        ModelWorkload(predictor, pool, targets),
-        *(
-            PhysicsWorkload(name, pool, targets, contract.horizon_steps, contract.dt_s)
-            for name in PHYSICS
-        ),
-    )
+def physics(contract: ModelContract, pool: ScenePool, targets: int) -> tuple[PhysicsWorkload, ...]:
+    """All of PHYSICS, on the scenes that a model of this contract is asked about."""
+    steps, dt_s = contract.horizon_steps, contract.dt_s
+    return tuple(PhysicsWorkload(name, pool, targets, steps, dt_s) for name in PHYSICS)

@@ -10,12 +10,13 @@ from eqrt.runtime.bench.cold_start import ColdStart
 from eqrt.runtime.bench.environment import Environment, ModelIdentity
 from eqrt.runtime.bench.percentiles import CONFIDENCE, PERCENTILES, Estimate
 from eqrt.runtime.bench.report import (
+    GENERATED,
+    NOUNS,
     Case,
     Distribution,
     Punctuality,
     Report,
     Settings,
-    counted,
 )
 from eqrt.runtime.bench.resources import Resources
 
@@ -40,9 +41,13 @@ def heading_lines(
         f"{name} {getattr(environment, name)}"
         for name in ("eqrt", "python", "numpy", "onnxruntime")
     ]
+    service = []
+    if settings.bus is not None:
+        service.append(f"the service on {settings.bus}; traffic {settings.log or GENERATED}")
     return _wrapped(
         f"{model.name} {model.version} ({model.sha256[:8]}), {threads}, {settings.duty()}, "
         f"{settings.seconds:g} s a case",
+        *service,
         ", ".join(part for part in machine if part),
         ", ".join(versions),
         f"cold start {cold_start.total_s:.2f} s, slowest of {cold_start.starts} "
@@ -56,7 +61,7 @@ def heading_lines(
 def case_lines(case: Case) -> list[str]:
     """One number of targets: percentiles of every workload, resources, verdict, advice."""
     names = [*PERCENTILES, "max", "CPU"]
-    title = f"{counted(case.targets)}, ms"
+    title = f"{case.title}, ms"
     lines = [
         "",
         f"{title:<{_NAME}}" + "".join(f"{name:>{_COLUMN}}" for name in names) + "  samples",
@@ -79,8 +84,9 @@ def closing_lines(report: Report) -> list[str]:
     if report.valid:
         return ["", "VALID"]
     bad = [str(case.targets) for case in report.cases if not case.valid]
+    noun = NOUNS[report.settings.benchmark]
     missing = len(report.settings.targets) - len(report.cases)
-    parts = [f"targets {', '.join(bad)}"] if bad else []
+    parts = [f"{noun}s {', '.join(bad)}"] if bad else []
     parts += [f"{missing} cases not measured"] if missing else []
     return ["", f"INVALID: {'; '.join(parts)}: measure again on a quiet machine"]
 
@@ -91,7 +97,7 @@ def comparison_lines(comparison: Comparison) -> list[str]:
     for change in comparison.changes:
         mark = " *" if change.significant else "  "
         lines.append(
-            f"{f'{counted(change.targets)}, {change.percentile}':<26}{interval(change.before):>24}"
+            f"{f'{change.title}, {change.percentile}':<26}{interval(change.before):>24}"
             f"{interval(change.now):>28}{change.ratio:>12.3f}{mark}"
         )
     lines.append(f"* the intervals ({CONFIDENCE:.0%}) are apart")
