@@ -45,7 +45,7 @@ def test_back_to_back_with_a_budget_and_a_baseline_that_nothing_can_keep(
     assert [load.name for load in measured.workloads] == [
         "model",
         "constant velocity",
-        "constant turn",
+        "constant turn rate",
         "Kalman filter",
     ]
     assert list(model.stages) == ["gather", "infer", "map frame"]

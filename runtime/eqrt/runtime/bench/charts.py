@@ -127,11 +127,11 @@ def _grid(x: Axis, y: Axis, x_unit: str, y_unit: str) -> Iterator[str]:
     for tick in y.ticks():
         at = y.at(tick)
         yield f'<line class="grid" x1="{_LEFT}" x2="{WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
-        yield _text(_LEFT - 5, at + 4, _shown(tick), "end")
+        yield _text(_LEFT - 5, at + 4, shown(tick), "end")
     for tick in x.ticks():
         at = x.at(tick)
         anchor = "middle" if at < WIDTH - _RIGHT - 12 else "end"  # else it would be cut off
-        yield _text(at, HEIGHT - _BOTTOM + 14, _shown(tick), anchor)
+        yield _text(at, HEIGHT - _BOTTOM + 14, shown(tick), anchor)
     yield _text(WIDTH - _RIGHT, HEIGHT - 3, x_unit, "end", "unit")
     yield _text(4, 11, y_unit, "start", "unit")
 
@@ -165,7 +165,8 @@ def _text(x: float, y: float, text: str, anchor: str, style: str = "label") -> s
     return f'<text class="{style}" {place}>{escape(text)}</text>'
 
 
-def _shown(value: float) -> str:
+def shown(value: float) -> str:
+    """A tick's label."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
 
 

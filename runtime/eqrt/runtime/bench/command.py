@@ -37,6 +37,10 @@ def run(args: argparse.Namespace) -> int:
     before = allowed_cores()
     if args.cpus is not None:
         allow_cores(parse_cores(args.cpus))
+    if benchmark == options.OPERATORS:
+        return _operators(args, settings)
+    if benchmark == options.COMPARISON:
+        return _side_by_side(args, settings)
     report = _measured(args, settings, before)
     comparison = compare(baseline, report) if baseline else None
     if comparison is not None:
@@ -55,6 +59,27 @@ def _measured(args: argparse.Namespace, settings: Settings, before: Sequence[int
     )
 
     return bench_service(setup_of(args, before, allowed_cores()), settings, _say)
+
+
+def _operators(args: argparse.Namespace, settings: Settings) -> int:
+    from eqrt.runtime.bench.operators.bench import bench_operators  # noqa: PLC0415 (seldom used)
+
+    found = bench_operators(options.artifact_of(args), settings, _say)
+    _write(args.json, to_json(found))
+    return 0
+
+
+def _side_by_side(args: argparse.Namespace, settings: Settings) -> int:
+    from eqrt.runtime.bench.side_by_side import accuracy, bench, pareto, report  # noqa: PLC0415
+
+    evals = [accuracy.read_eval(path) for path in args.accuracy or ()]
+    stretch = args.seconds is None
+    found = bench.bench_side_by_side(args.compare, evals, settings, _say, stretch=stretch)
+    _write(args.json, to_json(found))
+    _write(args.markdown, report.markdown(found))
+    if args.plot is not None:
+        _write(args.plot, pareto.draw(found))
+    return 0
 
 
 def _judge(report: Report, budget: Budget | None, comparison: Comparison | None) -> int:

@@ -1,13 +1,14 @@
 """Runs workloads by a schedule and keeps every sample, then sums them up.
 
-In every turn all workloads run, always in the same order: the one that is judged comes first, right
-after the wake-up, as it would in the car; the others meet the same scenes at the same time.
+In every turn all workloads run. The one that is judged comes first, right after the wake-up, as it
+would in the car, and the others meet the same scenes at the same time; or they take turns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -68,24 +69,34 @@ def measure(
     *,
     between: Callable[[], None],
     should_stop: Callable[[], bool],
+    rotating: bool = False,
 ) -> Measurement:
     """Make the turns, or as many as come before `should_stop`; `between` is called after each.
+
+    `rotating`: another workload begins in every turn, instead of always the first.
 
     `expected`: about how many turns there will be; room for them is made first, so that keeping
     samples does not look like growing memory.
     """
     samples = Samples(_TURN + sum(len(w.stages) + 1 for w in workloads), expected)
     for turn in turns:
-        row = [turn.number, turn.due_ns, turn.started_ns, int(turn.waited)]
-        for workload in workloads:
-            before_ns = cpu_ns()
-            row += workload.run(turn.number)
-            row.append(cpu_ns() - before_ns)
-        samples.append(row)
+        first = turn.number % len(workloads) if rotating else 0
+        parts = [_run(workload, turn.number) for workload in workloads[first:]]
+        parts[:0] = [_run(workload, turn.number) for workload in workloads[:first]]
+        samples.append(
+            [turn.number, turn.due_ns, turn.started_ns, int(turn.waited), *chain(*parts)]
+        )
         between()
         if should_stop():
             break
     return taken_apart(samples.rows(), workloads)
+
+
+def _run(workload: Workload, number: int) -> list[int]:
+    """Its stages, and its CPU time."""
+    before_ns = cpu_ns()
+    stages_ns = workload.run(number)
+    return [*stages_ns, cpu_ns() - before_ns]
 
 
 def results(workloads: Sequence[Timed], measured: Measurement) -> tuple[WorkloadResult, ...]:

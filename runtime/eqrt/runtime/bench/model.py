@@ -88,6 +88,8 @@ def measure_case(
     settings: Settings,
     environment: Environment,
     should_stop: Callable[[], bool],
+    *,
+    rotating: bool = False,
 ) -> Case | None:
     """Warm up, measure, sum up; None if told to stop before the first turn."""
     turn_s = warm_up(loads)
@@ -103,6 +105,7 @@ def measure_case(
         _expected(settings, turn_s),
         between=watch.look,
         should_stop=should_stop,
+        rotating=rotating,
     )
     seconds = (CLOCK() - started_ns) / 1e9
     resources = watch.finish()

@@ -25,17 +25,17 @@ from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 
 COMPARISON, OPERATORS = "compare", "operators"
 RATE_HZ = 10.0
-_SECONDS = 20.0
+_SECONDS = {MODEL: 20.0, SERVICE: 20.0, OPERATORS: 5.0, COMPARISON: 20.0}
 _MAX_TARGETS, _MAX_OBJECTS, _MAX_THREADS, _MAX_SECONDS = 1024, 64, 256, 86_400.0
-_MAX_RATE_HZ = {MODEL: 10_000.0, COMPARISON: 10_000.0, SERVICE: 16.0}
+_MAX_RATE_HZ = {MODEL: 10_000.0, SERVICE: 16.0}
 """The service lets cycles that are closer than 60 ms share a prediction."""
 _DEFAULT_COUNTS = {MODEL: "1,8,32", SERVICE: "1,8,32,64", OPERATORS: "1,32", COMPARISON: "1,32"}
 _ONLY: Mapping[str, tuple[str, ...]] = {
     "model": (MODEL, SERVICE, OPERATORS),
     "targets": (MODEL, OPERATORS, COMPARISON),
     "objects": (SERVICE,),
-    "schedule": (MODEL, SERVICE, COMPARISON),
-    "rate": (MODEL, SERVICE, COMPARISON),
+    "schedule": (MODEL, SERVICE),
+    "rate": (MODEL, SERVICE),
     "html": (MODEL, SERVICE),
     "budget": (MODEL, SERVICE),
     "baseline": (MODEL, SERVICE),
@@ -124,7 +124,8 @@ def _add_load(parser: argparse.ArgumentParser) -> None:
         "--seconds",
         type=float,
         metavar="S",
-        help=f"how long each case runs (default: {_SECONDS:g}; periodic: what a {WANTED} takes)",
+        help=f"how long each case runs (default: {_SECONDS[MODEL]:g}, with --operators "
+        f"{_SECONDS[OPERATORS]:g}; periodic and --compare: at least what a {WANTED} takes)",
     )
 
 
@@ -220,7 +221,9 @@ def settings_of(args: argparse.Namespace, benchmark: str) -> Settings:
     _check_range("--seconds", args.seconds, 0.1, _MAX_SECONDS)
     seconds = args.seconds
     if seconds is None:
-        seconds = max(_SECONDS, round(1.05 * samples_needed(WANTED) / rate_hz) if rate_hz else 0.0)
+        seconds = max(
+            _SECONDS[benchmark], round(1.05 * samples_needed(WANTED) / rate_hz) if rate_hz else 0.0
+        )
     return Settings(
         benchmark=benchmark,
         targets=_counts(args, benchmark),

@@ -45,6 +45,11 @@ class TimedPredictor(Predictor):
         super().__init__(self.session, contract, sha256, metadata)
         self.sha256 = sha256
         """Of `model.onnx`, all 64 digits."""
+        self._metadata = metadata
+
+    def with_session(self, session: Any) -> TimedPredictor:
+        """The same model, run by another session."""
+        return TimedPredictor(session, self.contract, self.sha256, self._metadata)
 
 
 def load_timed(artifact: Path, threads: int) -> TimedPredictor:
@@ -124,7 +129,7 @@ def _kalman(scene: Scene, horizon_steps: int, dt_s: float) -> Any:
 
 PHYSICS = {
     "constant velocity": _constant_velocity,
-    "constant turn": _constant_turn,
+    "constant turn rate": _constant_turn,
     "Kalman filter": _kalman,
 }
 

@@ -122,7 +122,7 @@ class Case:
     @property
     def title(self) -> str:
         """`8 targets`, `8 objects`."""
-        return counted(self.targets, self.judged.name)
+        return counted(self.targets, SERVICE if self.judged.name == SERVICE else MODEL)
 
     @property
     def judged(self) -> WorkloadResult:

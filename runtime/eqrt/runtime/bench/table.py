@@ -28,9 +28,37 @@ def heading_lines(
     settings: Settings, environment: Environment, model: ModelIdentity, cold_start: ColdStart
 ) -> list[str]:
     """What is measured where, and the cold start."""
+    return model_lines(settings, environment, model) + _wrapped(
+        f"cold start {cold_start.total_s:.2f} s, slowest of {cold_start.starts} "
+        f"{cold_start.slowest_s:.2f} s (import {cold_start.import_s:.2f}, load "
+        f"{cold_start.load_s:.2f}, first answer {1e3 * cold_start.first_s:.1f} ms); memory "
+        f"{cold_start.rss_mib:.1f} MiB, of which numpy and onnxruntime "
+        f"{cold_start.rss_bare_mib:.1f}",
+    )
+
+
+def model_lines(settings: Settings, environment: Environment, model: ModelIdentity) -> list[str]:
+    """What is measured where."""
+    service = []
+    if settings.bus is not None:
+        service.append(f"the service on {settings.bus}; traffic {settings.log or GENERATED}")
+    return _wrapped(
+        f"{model.name} {model.version} ({model.sha256[:8]}), {duty(settings)}",
+        *service,
+        *machine(environment),
+    )
+
+
+def duty(settings: Settings) -> str:
+    """`1 thread, back-to-back, 20 s a case`."""
     threads = f"{settings.threads} thread{'s' * (settings.threads != 1)}"
+    return f"{threads}, {settings.duty()}, {settings.seconds:g} s a case"
+
+
+def machine(environment: Environment) -> list[str]:
+    """Hardware; software."""
     cores = ",".join(map(str, environment.cores_allowed))
-    machine = [
+    parts = [
         environment.cpu,
         f"cores {cores} of {environment.cores_present}",
         f"governor {environment.governor}" if environment.governor else "",
@@ -41,21 +69,7 @@ def heading_lines(
         f"{name} {getattr(environment, name)}"
         for name in ("eqrt", "python", "numpy", "onnxruntime")
     ]
-    service = []
-    if settings.bus is not None:
-        service.append(f"the service on {settings.bus}; traffic {settings.log or GENERATED}")
-    return _wrapped(
-        f"{model.name} {model.version} ({model.sha256[:8]}), {threads}, {settings.duty()}, "
-        f"{settings.seconds:g} s a case",
-        *service,
-        ", ".join(part for part in machine if part),
-        ", ".join(versions),
-        f"cold start {cold_start.total_s:.2f} s, slowest of {cold_start.starts} "
-        f"{cold_start.slowest_s:.2f} s (import {cold_start.import_s:.2f}, load "
-        f"{cold_start.load_s:.2f}, first answer {1e3 * cold_start.first_s:.1f} ms); memory "
-        f"{cold_start.rss_mib:.1f} MiB, of which numpy and onnxruntime "
-        f"{cold_start.rss_bare_mib:.1f}",
-    )
+    return [", ".join(part for part in parts if part), ", ".join(versions)]
 
 
 def case_lines(case: Case) -> list[str]:
@@ -117,7 +131,11 @@ def _row(name: str, distribution: Distribution, more: str = "") -> str:
     found = distribution.percentiles
     cells = [ms(found[key].value_ns) if key in found else "-" for key in PERCENTILES]
     cells.append(ms(distribution.max_ns))
-    return f"{name:<{_NAME}}" + "".join(f"{cell:>{_COLUMN}}" for cell in cells) + more
+    return f"{_shortened(name):<{_NAME}}" + "".join(f"{cell:>{_COLUMN}}" for cell in cells) + more
+
+
+def _shortened(name: str) -> str:
+    return name if len(name) < _NAME else f"{name[: _NAME - 2]}…"
 
 
 def _confidence(found: Mapping[str, Estimate]) -> str:
