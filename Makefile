@@ -29,7 +29,7 @@ lint: $(VENV)/.installed ## check format, style, types, and who imports whom
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-bench: $(VENV)/.installed ## measure against the budgets; wants a quiet machine
+bench: $(VENV)/.installed ## measure against the budgets, in 9 minutes; wants a quiet machine
 	$(VENV)/bin/python -m pytest --benchmark-enable --benchmark-only tests/bench
 
 figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, measured; wants it quiet

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,3 +160,12 @@ def bench_for_real(folder: Path, said: pytest.CaptureFixture[str], *options: str
     return Run(
         status, said.readouterr().out, read_json(Report, written[0], SCHEMA), written[1].read_text()
     )
+
+
+def documented_keys(values: Any) -> set[str]:
+    """All keys in it, at any depth."""
+    if isinstance(values, list):
+        return set().union(*map(documented_keys, values))
+    if isinstance(values, dict):
+        return set(values).union(*map(documented_keys, values.values()))
+    return set()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench_reports import bench
+from bench_reports import bench, documented_keys
 from eqrt.core.errors import UsageError
 from eqrt.runtime.bench.json_form import read_json
 from eqrt.runtime.bench.operators.bench import SCHEMA, OperatorReport
@@ -18,6 +18,7 @@ from eqrt.runtime.bench.operators.profile import profiled, times_by_operator, wo
 from eqrt.runtime.bench.table import WIDTH
 from eqrt.runtime.prediction.graph_writer import Node, write_model
 from eqrt.runtime.prediction.predictor import open_session
+from source_tree import ROOT
 
 
 def test_the_shipped_model_for_real(
@@ -36,6 +37,9 @@ def test_the_shipped_model_for_real(
     assert max(map(len, said)) <= WIDTH
     assert "measured / (arithmetic + overhead)" in "\n".join(said)
     report = read_json(OperatorReport, written, SCHEMA)
+    text = (ROOT / "docs/benchmarks.md").read_text(encoding="utf-8")
+    keys = documented_keys(json.loads(written.read_text()))
+    assert [key for key in keys if key not in text] == []
     one, twenty = report.cases
     assert 19.0 < twenty.flops / one.flops < 21.0
     assert twenty.nodes == 2 * one.nodes  # 16 targets at most in each run of the graph

@@ -11,7 +11,16 @@ from xml.etree import ElementTree
 
 import pytest
 
-from bench_reports import ENVIRONMENT, MS, Constant, bench, case, report, result
+from bench_reports import (
+    ENVIRONMENT,
+    MS,
+    Constant,
+    bench,
+    case,
+    documented_keys,
+    report,
+    result,
+)
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bench.json_form import read_json, to_json
 from eqrt.runtime.bench.measure import measure
@@ -21,6 +30,7 @@ from eqrt.runtime.bench.side_by_side.pareto import Point, draw, front
 from eqrt.runtime.bench.side_by_side.report import SCHEMA, ComparedModel, SideBySide, markdown
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from handmade_model import write_handmade
+from source_tree import ROOT
 
 CARD = [
     ["metric", "this model", "constant velocity"],
@@ -236,6 +246,13 @@ def test_a_comparison_comes_back_from_json_as_it_went(tmp_path: Path) -> None:
     found = side_by_side(accuracy(0.9), None)
     path.write_text(to_json(found))
     assert read_json(SideBySide, path, SCHEMA) == found
+
+
+def test_every_key_is_documented() -> None:
+    keys = documented_keys(json.loads(to_json(side_by_side(accuracy(0.9)))))
+    text = (ROOT / "docs/benchmarks.md").read_text(encoding="utf-8")
+    made_up = {"constant velocity", "first", "second"}
+    assert [key for key in keys - made_up if key not in text] == []
 
 
 def test_the_front_is_what_nobody_beats_in_both() -> None:
