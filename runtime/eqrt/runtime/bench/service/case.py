@@ -68,6 +68,8 @@ def measure_service(
         samples: Int64 = np.load(rows) if told is not None else np.zeros((0, WIDTH), np.int64)
     if told is None or not len(samples):
         return None
+    if not set(setup.traffic_cores) & set(environment.cores_allowed):
+        told["traffic_cpu_s"] = 0.0  # not of these cores
     return _case(objects, settings, environment, samples, told)
 
 
