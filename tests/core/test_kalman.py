@@ -17,11 +17,11 @@ def straight(steps: int = 20, velocity: tuple[float, float] = (10.0, -2.0)) -> n
 
 
 def test_two_measurements_weigh_the_step_between_them_against_what_was_known_before() -> None:
-    """With 0.2 m, 15 m/s and 2 m/s2: a step of 1 m is worth 22.502 / 2.3301 m/s."""
+    """With 0.2 m, 15 m/s and 4 m2/s3: a step of 1 m is worth 22.52 / 2.33133 m/s."""
     _, velocity = kalman_velocity(np.array([[[0.0, 0.0], [1.0, 0.0]]]), EVERY[:, :2], DT_S)
-    both = 0.1 * (225.0 + 0.02)  # covariance of position and velocity before the second one
-    spread = 0.04 + 0.01 * (225.0 + 0.01) + 0.04  # of the second one
-    assert both / spread == pytest.approx(22.502 / 2.3301)
+    both = 0.1 * 225.0 + 4.0 * 0.01 / 2  # of position with velocity before the second one
+    spread = 0.04 + 0.01 * 225.0 + 4.0 * 0.001 / 3 + 0.04  # of the second one
+    assert both / spread == pytest.approx(22.52 / 2.33133, rel=1e-5)
     np.testing.assert_allclose(velocity, [[both / spread, 0.0]])
 
 
@@ -78,13 +78,15 @@ def test_it_is_the_textbooks_filter() -> None:
 
 def textbook(seen: np.ndarray, valid: np.ndarray) -> np.ndarray:
     move = np.array([[1.0, DT_S], [0.0, 1.0]])
-    push = constants.ACCELERATION_STD_MPS2 * np.array([[DT_S**2 / 2], [DT_S]])
+    push = constants.ACCELERATION_DENSITY_M2_S3 * np.array(
+        [[DT_S**3 / 3, DT_S**2 / 2], [DT_S**2 / 2, DT_S]]
+    )
     look = np.array([[1.0, 0.0]])
     first = int(np.argmax(valid))
     state = np.array([seen[first], 0.0])
     spread = np.diag([constants.POSITION_STD_M**2, constants.FIRST_SPEED_STD_MPS**2])
     for step in range(first + 1, len(seen)):
-        state, spread = move @ state, move @ spread @ move.T + push @ push.T
+        state, spread = move @ state, move @ spread @ move.T + push
         if valid[step]:
             gain = spread @ look.T / (look @ spread @ look.T + constants.POSITION_STD_M**2)
             state = state + gain[:, 0] * (seen[step] - state[0])

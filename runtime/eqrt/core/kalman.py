@@ -1,7 +1,7 @@
 """A Kalman filter of constant velocity: what a classical tracker would predict.
 
-The state of a target is its position and velocity. Between two steps the velocity changes by white
-noise; a step that was seen is a measurement of the position. Both axes have the same noise, so the
+The state of a target is its position and velocity. The velocity changes by white noise; a step that
+was seen is a measurement of the position. Both axes have the same noise, so the
 result does not depend on the frame.
 
 Such a filter is linear: position and velocity in the end are sums of the measurements, weighted by
@@ -20,8 +20,9 @@ Bool = NDArray[np.bool_]
 
 POSITION_STD_M = 0.2
 """Of a measured position: what automotive radars and cameras do at medium range."""
-ACCELERATION_STD_MPS2 = 2.0
-"""Constant between two steps, independent from one to the next: braking and cornering."""
+ACCELERATION_DENSITY_M2_S3 = 4.0
+"""Of the white noise that stands for braking and cornering: an acceleration of 1.4 m/s2 that lasts
+for a second comes to twice its square (2 sigma^2 tau)."""
 FIRST_SPEED_STD_MPS = 15.0
 """Of a velocity of which nothing is known yet."""
 _PATTERNS = 4096  # kept; of 20 steps 1.3 MB
@@ -56,10 +57,10 @@ def _weights(pattern: bytes, dt_s: float) -> Float64:
     weights[0, first] = 1.0
     covariance = np.diag([POSITION_STD_M**2, FIRST_SPEED_STD_MPS**2])
     move = np.array([[1.0, dt_s], [0.0, 1.0]])
-    push = ACCELERATION_STD_MPS2 * np.array([dt_s**2 / 2, dt_s])
+    push = ACCELERATION_DENSITY_M2_S3 * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
     for step in range(first + 1, len(seen)):
         weights = move @ weights
-        covariance = move @ covariance @ move.T + np.outer(push, push)
+        covariance = move @ covariance @ move.T + push
         if seen[step]:
             gain = covariance[:, 0] / (covariance[0, 0] + POSITION_STD_M**2)
             weights -= np.outer(gain, weights[0])
