@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import replace
 from itertools import count, pairwise
 from pathlib import Path
@@ -22,7 +23,7 @@ from eqrt.runtime.bench.service.bench import objects_in
 from eqrt.runtime.bench.service.case import Setup, measure_service
 from eqrt.runtime.bench.service.crowd import MESSAGE_S, crowded_cycles
 from eqrt.runtime.bench.service.journal import STAGES
-from eqrt.runtime.bench.service.orders import BusOrder, TrafficOrder
+from eqrt.runtime.bench.service.orders import BusOrder, ServiceOrder, TrafficOrder
 from eqrt.runtime.bench.service.programs import Program
 from eqrt.runtime.bench.table import WIDTH, case_lines, closing_lines
 from eqrt.runtime.bus.buses import LOCAL, open_bus
@@ -105,13 +106,16 @@ def test_a_listener_on_the_bus_sees_the_same_latency() -> None:
     channel = next(CHANNELS)
     bus = BusOrder(channel=channel, interface=LOCAL, fd=True)
     settings = replace(SERVICE_REPORT.settings, targets=(4,), seconds=4.0)
-    environment = read_environment()
     with Heard(channel) as heard:
-        case = measure_service(setup_on(bus), 4, settings, environment)
+        case = measure_service(setup_on(bus), 4, settings, read_environment(), never)
     assert case is not None
     outside_ns = 1e9 * float(np.median(latencies_s(heard.messages)))
     inside_ns = case.judged.total.percentiles["p50"].value_ns
     assert outside_ns == pytest.approx(inside_ns, rel=0.5)
+
+
+def never() -> bool:
+    return False
 
 
 def setup_on(bus: BusOrder) -> Setup:
@@ -144,7 +148,7 @@ def test_traffic_comes_at_its_rate_and_says_how_late_it_was() -> None:
     """Sixteen cycles, whole, in about a second."""
     bus = BusOrder(channel=next(CHANNELS), interface=LOCAL, fd=None)
     order = TrafficOrder(bus=bus, cores=(0,), objects=4, period_s=1 / 16, log=None)
-    with open_bus(bus.channel, LOCAL) as ear, Program(order) as traffic:
+    with open_bus(bus.channel, LOCAL) as ear, Program(order, never) as traffic:
         assert traffic.wait_for("ready")
         heard: list[can.Message] = []
         while len(heard) < 16 * (3 + 1 + 2 * 4):
@@ -167,11 +171,46 @@ def test_traffic_comes_at_its_rate_and_says_how_late_it_was() -> None:
     assert heard[-1].timestamp - heard[0].timestamp > 0.5  # not all at once
 
 
+def test_told_to_stop_both_programs_say_what_they_have(tmp_path: Path) -> None:
+    bus, rows = BusOrder(channel=next(CHANNELS), interface=LOCAL, fd=None), "rows.npy"
+    stop: list[str] = []
+    order = ServiceOrder(
+        bus=bus,
+        cores=allowed_cores(),
+        profile="generic",
+        model=str(DEFAULT_ARTIFACT),
+        tile=None,
+        stationary=False,
+        threads=1,
+        seconds=600.0,
+        expected=100,
+        answered_clock=True,
+        rows=str(tmp_path / rows),
+    )
+    sent = TrafficOrder(bus=bus, cores=allowed_cores(), objects=2, period_s=None, log=None)
+    with Program(order, lambda: bool(stop)) as serving:
+        assert serving.wait_for("ready")
+        with Program(sent, lambda: bool(stop)) as traffic:
+            assert serving.wait_for("measuring")
+            time.sleep(1.0)
+            stop.append("now")
+            told, ended = serving.wait_for("measured"), traffic.wait_for("ended")
+            assert serving.wait_for("anything more") is None
+    assert told is not None
+    assert told["seconds"] < 600.0
+    assert len(np.load(tmp_path / rows)) > 0
+    assert ended is not None
+    assert ended["cycles"] > 30
+
+
 def test_a_process_that_fails_says_why(tmp_path: Path) -> None:
     bus = BusOrder(channel="x", interface=LOCAL, fd=None)
     log = str(tmp_path / "nowhere.log")
     order = TrafficOrder(bus=bus, cores=(0,), objects=1, period_s=None, log=log)
-    with Program(order) as traffic, pytest.raises(EqrtError, match=r"traffic failed: .*nowhere"):
+    with (
+        Program(order, never) as traffic,
+        pytest.raises(EqrtError, match=r"traffic failed: .*nowhere"),
+    ):
         traffic.wait_for("ended")
 
 

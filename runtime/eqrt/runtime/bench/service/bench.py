@@ -104,10 +104,10 @@ def bench_service(setup: Setup, settings: Settings, say: Say) -> Report:
     settings = replace(settings, bus=_named(setup.bus))
     cases: list[Case] = []
     with until_told_to_stop() as should_stop:
-        cold_start = measure_service_start(setup, settings, environment)
+        cold_start = measure_service_start(setup, settings, environment, should_stop)
         say(heading_lines(settings, environment, model, cold_start))
         for objects in settings.targets:
-            case = measure_service(setup, objects, settings, environment)
+            case = measure_service(setup, objects, settings, environment, should_stop)
             if case is None:
                 break
             cases.append(case)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from eqrt.core.errors import EqrtError
 from eqrt.runtime.bench.cold_start import STARTS, ColdStart, medians
 from eqrt.runtime.bench.environment import Environment
 from eqrt.runtime.bench.json_form import parse
@@ -56,14 +57,16 @@ def measure_service(
     objects: int,
     settings: Settings,
     environment: Environment,
+    should_stop: Callable[[], bool],
 ) -> Case | None:
-    """Start both processes, measure, sum up; None if they were told to stop before that."""
+    """Start both processes, measure, sum up; None if told to stop before anything was measured."""
     with tempfile.TemporaryDirectory(prefix="eqrt-bench-") as folder:
         rows = Path(folder) / "rows.npy"
         order = _service_order(setup, settings, environment, rows)
-        with Program(order) as serving:
+        with Program(order, should_stop) as serving:
             serving.wait_for("ready")
-            with Program(_traffic_order(setup, objects, settings.rate_hz)) as traffic:
+            sent = _traffic_order(setup, objects, settings.rate_hz)
+            with Program(sent, should_stop) as traffic:
                 told = _watched(serving, traffic, settings)
         samples: Int64 = np.load(rows) if told is not None else np.zeros((0, WIDTH), np.int64)
     if told is None or not len(samples):
@@ -73,20 +76,28 @@ def measure_service(
     return _case(objects, settings, environment, samples, told)
 
 
-def measure_service_start(setup: Setup, settings: Settings, environment: Environment) -> ColdStart:
-    """Start the service STARTS times beside traffic that never stops."""
+def measure_service_start(
+    setup: Setup, settings: Settings, environment: Environment, should_stop: Callable[[], bool]
+) -> ColdStart:
+    """Start the service STARTS times beside traffic that never stops.
+
+    Raises EqrtError if told to stop meanwhile.
+    """
     order = replace(
         _service_order(setup, settings, environment, Path("unused")), seconds=86_400.0, expected=1
     )
-    with Program(_traffic_order(setup, min(settings.targets), 1.0 / _COLD_PERIOD_S)) as traffic:
+    order = replace(order, answered_clock=False)
+    sent = _traffic_order(setup, min(settings.targets), 1.0 / _COLD_PERIOD_S)
+    with Program(sent, should_stop) as traffic:
         traffic.wait_for("ready")
-        return medians([_start(replace(order, answered_clock=False)) for _ in range(STARTS)])
+        return medians([_start(order, should_stop) for _ in range(STARTS)])
 
 
-def _start(order: ServiceOrder) -> dict[str, float]:
-    with Program(order) as serving:
-        ready = serving.wait_for("ready") or {}
-        first = serving.wait_for("first") or {}
+def _start(order: ServiceOrder, should_stop: Callable[[], bool]) -> dict[str, float]:
+    with Program(order, should_stop) as serving:
+        ready, first = serving.wait_for("ready"), serving.wait_for("first")
+        if ready is None or first is None:
+            raise EqrtError("stopped before anything was measured")
         return {
             "total_ns": CLOCK() - serving.started_ns,
             **{key: ready[key] for key in ("import_ns", "load_ns", "bare_mib")},

@@ -18,7 +18,7 @@ import numpy as np
 from eqrt.runtime.bench.resources import Watch, resident_mib
 from eqrt.runtime.bench.schedule import CLOCK
 from eqrt.runtime.bench.service.journal import Journal, NotingPublisher, NotingReceiver
-from eqrt.runtime.bench.service.orders import ServiceOrder, read_order, say
+from eqrt.runtime.bench.service.orders import ServiceOrder, read_order, say, while_wanted
 from eqrt.runtime.bus.buses import open_bus
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.publish_can import CanPublisher
@@ -26,7 +26,6 @@ from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.service import ArrivalClock, Service
-from eqrt.runtime.signals import until_told_to_stop
 
 WARM_UP = 30
 """Predictions that are not counted: histories fill up, and lazily made things are made."""
@@ -50,7 +49,7 @@ def serve(import_ns: int, bare_mib: float) -> None:
     wanted, ids = order.bus, profile.arbitration_ids
     with (
         open_bus(wanted.channel, wanted.interface, fd=wanted.fd, receive_ids=ids) as bus,
-        until_told_to_stop() as should_stop,
+        while_wanted() as should_stop,
     ):
         ready_ns = CLOCK()
         say("ready", import_ns=import_ns, load_ns=ready_ns - begun_ns, bare_mib=bare_mib)

@@ -5,13 +5,16 @@ Each prints lines of JSON, one for every thing that has happened; `say` writes o
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
 from eqrt.runtime.bench.json_form import parse
+from eqrt.runtime.signals import until_told_to_stop
 
 Order = TypeVar("Order")
 
@@ -67,6 +70,14 @@ def read_order(kind: type[Order]) -> Order:
     order = parse(kind, json.loads(sys.argv[1]))
     os.sched_setaffinity(0, order.cores)  # type: ignore[attr-defined] # every order has them
     return order
+
+
+@contextlib.contextmanager
+def while_wanted() -> Iterator[Callable[[], bool]]:
+    """Gives `should_stop()`: true when told to, or when nobody is left who could."""
+    parent = os.getppid()
+    with until_told_to_stop() as is_told:
+        yield lambda: is_told() or os.getppid() != parent
 
 
 def written(order: Any) -> str:

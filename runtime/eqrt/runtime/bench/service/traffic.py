@@ -18,13 +18,12 @@ import numpy as np
 
 from eqrt.runtime.bench.schedule import CLOCK
 from eqrt.runtime.bench.service.crowd import MESSAGE_S, Cycle, crowded_cycles
-from eqrt.runtime.bench.service.orders import TrafficOrder, read_order, say
+from eqrt.runtime.bench.service.orders import TrafficOrder, read_order, say, while_wanted
 from eqrt.runtime.bus.buses import open_bus
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.output.can_output import CLASSIC_TIMES_S, STATUS, STATUS_CLASSIC, Offset
 from eqrt.runtime.output.publish_can import BASE_ID
 from eqrt.runtime.play import OTHERS, Player, send
-from eqrt.runtime.signals import until_told_to_stop
 
 ANSWER_S = 1.0
 """A cycle that is not answered by then is lost, and the next one is sent."""
@@ -38,7 +37,7 @@ def main() -> int:
     wanted = order.bus
     with (
         open_bus(wanted.channel, wanted.interface, fd=wanted.fd, receive_ids=heard) as bus,
-        until_told_to_stop() as should_stop,
+        while_wanted() as should_stop,
     ):
         if order.log is not None:
             _play(Path(order.log), bus, should_stop)
