@@ -53,6 +53,7 @@ class Program:
             told: dict[str, Any] = json.loads(line)
             if told["event"] == event:
                 return told
+        self._said.put(None)  # whoever asks next is told the same
         if self._process.wait() == 0 or self._should_stop():
             return None
         self._errors.seek(0)
