@@ -27,13 +27,13 @@ def test_one_screen_says_what_the_shipped_model_is(capsys: pytest.CaptureFixture
     assert run() == 0
     printed = capsys.readouterr().out
     for part in (
-        "model     eqrt-free 1.",
+        "model     eqrt-free 2.",
         "CC-BY-SA-4.0",
         "parameters, ",
         "ONNX opset 18, IR 8, by eqrt, as SHA256SUMS lists it",
-        "sizes     N 8, T 20, Q 6, L 21, H 30, K 1, dt 0.1 s",
+        "sizes     N 16, T 20, Q 6, L 21, H 30, K 1, dt 0.1 s",
         "lanes     routes",
-        "history            float32  (B, 8, 20, 2)",
+        "history            float32  (B, 16, 20, 2)",
         "ADE 3 s",
     ):
         assert part in printed
@@ -53,8 +53,8 @@ def test_a_licence_that_forbids_commercial_use_is_said_plainly(
 def test_json_holds_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(str(DEFAULT_ARTIFACT), "--json") == 0
     facts = json.loads(capsys.readouterr().out)
-    assert facts["contract"]["num_agents"] == 8
-    assert facts["inputs"]["history"] == ["float32", ["B", 8, 20, 2]]
+    assert facts["contract"]["num_agents"] == 16
+    assert facts["inputs"]["history"] == ["float32", ["B", 16, 20, 2]]
     assert facts["as_listed"] is True
     assert len(facts["model_id"]) == 8
 

@@ -161,7 +161,7 @@ def another_schema(folder: Path) -> None:
 
 
 def another_contract(folder: Path) -> None:
-    replace_in_model(folder, b'"num_agents": 8', b'"num_agents": 9')
+    replace_in_model(folder, b'"num_agents": 16', b'"num_agents": 17')
 
 
 def no_vectors(folder: Path) -> None:

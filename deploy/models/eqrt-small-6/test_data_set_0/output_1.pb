@@ -1,1 +1,1 @@
-BprobabilitiesJ§¥r>†g>}8:>å<3>àYÀ=ýc°=
+BprobabilitiesJ'ÿq>QÖm>¨©:>¬p/>½=Q¯=

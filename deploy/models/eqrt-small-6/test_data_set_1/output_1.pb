@@ -1,1 +1,1 @@
-BprobabilitiesJž¥r>è…g>z8:>ü<3>ZÀ=îc°=
+BprobabilitiesJÿq>]Öm>ž©:>Íp/>M½=¯=

@@ -1,1 +1,1 @@
-BprobabilitiesJ2Ú•>Édõ>4¸_>.U–=ÖA.=Å∂<
+BprobabilitiesJ[çê>?Íâ>KæN>ô#>œhä=:(ú<

@@ -1,1 +1,1 @@
-BprobabilitiesJrL¦>¼Þ›>MÙ_>Q¡Ï=gí*=LE<
+BprobabilitiesJÊ>oð‰>_²M>(i&>«a‰=‹š<

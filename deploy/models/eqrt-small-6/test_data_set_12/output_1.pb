@@ -1,1 +1,1 @@
-BprobabilitiesJyL¶>ºﬁõ>MŸ_>H°œ=RÌ*=,E<
+BprobabilitiesJÕê>qâ>]≤M>)i&>ôaâ=Åö<

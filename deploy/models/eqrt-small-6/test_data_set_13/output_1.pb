@@ -1,1 +1,1 @@
-BprobabilitiesJfº‹>È/h>O,N>þÙ>…úÑ=__Y=
+BprobabilitiesJxrc>iW>1a=>çƒ->û®>É ›=

@@ -1,1 +1,1 @@
-BprobabilitiesJ|h>±ï@>ž„:>@/>¨þ=FM¦=
+BprobabilitiesJ¦¾Z>”úM>´sK>Â%>°>k*¾=

@@ -1,1 +1,1 @@
-BprobabilitiesJih>¹ï@>ƒ„:>@/>c¨þ=JM¦=
+BprobabilitiesJ™¾Z>§úM>ËsK>­%>2°>.*¾=

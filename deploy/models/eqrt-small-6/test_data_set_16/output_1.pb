@@ -1,1 +1,1 @@
-BprobabilitiesJøXk>Gıf>>ñ<>Ê®->»Öƒ=Ò_¬=
+BprobabilitiesJBèo>wk>5a5>ÀÓ4>Ø–…=ÂK¨=

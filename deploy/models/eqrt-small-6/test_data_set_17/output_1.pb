@@ -1,1 +1,1 @@
-BprobabilitiesJƒq>ìÒc>Óa=>„ 1>†¹Ù=ìxž=
+BprobabilitiesJT¹t>ql>C¯G>'ç$>¶"´=±[°=

@@ -1,1 +1,1 @@
-BprobabilitiesJ…¥j>LŒ_>ÔèA>/‰)>Å_Õ=œX¿=
+BprobabilitiesJ&Vk>›ad>Ž2>ûr/>$'í=BX°=

@@ -1,2 +1,1 @@
-BprobabilitiesJl¥r>†g>h8:>
-=3>-ZÀ=ùc°=
+BprobabilitiesJ0ÿq>¾Öm>ˆ©:>Äp/>½=z¯=

@@ -1,1 +1,1 @@
-BprobabilitiesJ|Шq>Г-h>КjC>ЩЉ)>за=Xл‘=
+BprobabilitiesJ±@q>aДk>ЫG:>+ч/>Э”Ж=овЄ=

@@ -1,1 +1,1 @@
-BprobabilitiesJŠïz>K7u>kÁ6>ùš1>Q¹°=5@ž=
+BprobabilitiesJÆp„>'~>’*A>ý#>»Ùš=ÔŒ=

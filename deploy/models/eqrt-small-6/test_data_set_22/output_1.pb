@@ -1,1 +1,1 @@
-BprobabilitiesJXJ^>¹V>á@>Nž!>Ú‹>g$¡=
+BprobabilitiesJ“_u>©gZ>¥rL>O[>S´>åÙn=

@@ -1,1 +1,1 @@
-BprobabilitiesJX)m>ÅPh>á_>µ[5>VÚ•=Û·”=
+BprobabilitiesJG¬~>©ÈO>cˆC>²0->9•ð=¶‘=

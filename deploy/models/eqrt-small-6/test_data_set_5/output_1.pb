@@ -1,1 +1,1 @@
-BprobabilitiesJ»_>³&X>,›C>kT">;	>‚µ¡=
+BprobabilitiesJ#ÒS>ð³O>ëš<>e>.>¬—Ò=

@@ -1,1 +1,1 @@
-BprobabilitiesJæN`>ÉÚ^>Ùi6>Î'4>B^>ÇÌ‰=
+BprobabilitiesJd…c>Å‰_>C>'>‡˜>FWŽ=

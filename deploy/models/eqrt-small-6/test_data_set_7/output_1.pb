@@ -1,1 +1,1 @@
-BprobabilitiesJæN`>¸Ú^>Öi6>Ô'4>P^>ÕÌ‰=
+BprobabilitiesJ^…c>·‰_>:C>m'>¡˜>KWŽ=

@@ -1,1 +1,1 @@
-BprobabilitiesJõ	k>à)`>8>ÑP3>³&Ñ=åÃÁ=
+BprobabilitiesJ‚žr>\-m>8.:>o/>}5»=Gø±=

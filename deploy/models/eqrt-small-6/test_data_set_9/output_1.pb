@@ -1,1 +1,1 @@
-BprobabilitiesJÖ¹> jŒ>`ho>Ìœ>ëœ„=I7v<
+BprobabilitiesJ“½‹>yØˆ>ŒDA>®ö!>©²¬=Èúé<
