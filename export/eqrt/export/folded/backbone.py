@@ -1,12 +1,12 @@
 """EqMotion's backbone (`eqrt.training.networks.eqmotion`), folded.
 
-    geometric (B, 2, N, C)  coordinates first, so that what does not turn spreads over whole rows
-    pattern   (B N, D)      rows of agents
-    pairs     (B, ., 1, P)  columns, of the P = N (N - 1) pairs of different agents
+    geometric (B, 2, N C)  coordinates first, so that what does not turn spreads over whole rows
+    pattern   (B N, D)     rows of agents
+    pairs     (B P, .)     rows of the P = N (N - 1) pairs of different agents
 
-Per layer, all that is read from the pattern features is one product. From agents to pairs, and from
-pairs back to their receivers, lead products with constant matrices, and the masks are in these.
-What the last layer of a perceptron multiplies is multiplied with what comes next: its weights are.
+All that a layer reads from the pattern features is one product. From agents to pairs, and from pairs
+to those who receive, lead products with small matrices; masks are in these. The last layer of a
+perceptron is multiplied with the linear layer behind it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from torch.nn import functional
 
 from eqrt.export.folded.products import (
     Fixed,
-    PairColumns,
+    Linears,
+    PairRows,
     PairsOf,
-    Rows,
     SideBySide,
     last_layer,
     linears,
@@ -96,7 +96,7 @@ class FoldedEqMotion(nn.Module):
             geometric = geometric + self.pairs.target @ vectors.transpose(1, 2)
 
         neighbours = self._neighbours(agents, geometric.shape[-1])
-        pattern = rows.flatten(0, 1)
+        geometric, pattern = geometric.flatten(2), rows.flatten(0, 1)
         weights, biases = self.interaction(geometric, pattern, neighbours)
         for layer, bias in zip(self.layers, biases, strict=True):
             geometric, pattern = layer(geometric, pattern, weights, bias, neighbours)
@@ -112,48 +112,46 @@ class FoldedEqMotion(nn.Module):
     def _decode(
         self, geometric: Tensor, pattern: Tensor, origin: Tensor, neighbours: Neighbours
     ) -> tuple[Tensor, Tensor]:
-        target = self.norm(pattern.view(-1, geometric.shape[2], pattern.shape[1])[:, 0])
-        centre = geometric.flatten(2) @ neighbours.mean  # (B, 2, 1)
-        decoded = self.decoder(geometric[:, :, 0] - centre, target) + centre  # (B, 2, K H)
+        agents, channels = len(self.pairs.target), pattern.shape[1]
+        target = self.norm(pattern.view(-1, agents, channels)[:, 0])
+        centre = geometric @ neighbours.mean  # (B, 2, 1)
+        own = geometric[..., :channels] - centre  # of agent 0
+        decoded = self.decoder(own, target) + centre  # (B, 2, K H)
         trajectories = decoded.unflatten(-1, (self.modes, self.steps)).permute(0, 2, 3, 1)
         logits = None if self.logits is None else self.logits(target)
         return most_probable_first(origin + UNIT_M * trajectories, logits)
 
 
-class FoldedInteraction(nn.Module):
+class FoldedInteraction(Fixed):
     """Categories of all pairs; and what they make of the layers' biases, which no layer changes."""
 
     def __init__(
         self, of: InteractionReasoning, pairs: PairsOf, layers: list[FeatureLearning]
     ) -> None:
-        super().__init__()
+        super().__init__(of.message.distance.weight)
         like = of.message.distance.weight
         self.pairs = pairs
         self.message = FoldedMessage(of.message, of.update)
         self.read = SideBySide([receiver_sender(of.message), self.message.reads], like)
-        self.category_read = SideBySide([receiver_sender(of.category)], like)
-        self.category = PairColumns(of.category)
-        self.last = Fixed(like)
+        self.reread = Linears([receiver_sender(of.category)], like)
+        self.category = PairRows(of.category)
         weight, bias = last_layer(of.category)
-        biases = [last_layer(layer.geometric.interaction)[1].T for layer in layers]
-        self.last.keep(weight=weight[0].T[..., None, None], bias=bias[0])
-        self.last.keep(of_layers=torch.cat(biases)[..., None, None])
-        self.width = biases[0].shape[0]
+        self.last = Linears([(weight[0].T, bias[0])], like)
+        biases = [last_layer(layer.geometric.interaction)[1] for layer in layers]  # (R, C) each
+        self.keep(biases=torch.cat(biases, 1))
+        self.width = of.message.distance.weight.shape[2]
 
     def forward(
         self, geometric: Tensor, pattern: Tensor, neighbours: Neighbours
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Category weights (B, R W, 1, P), per channel, and each layer's bias (B, C, 1, P)."""
-        distance = distances(self.pairs.offsets(geometric))
+        """Category weights (B P, R W), the same for all W, and each layer's bias (B P, C)."""
+        distance = self.pairs.distances(geometric)
         sides, update = self.read(pattern)
         reasoned = self.message(distance, self.pairs.by_agent(sides), update, neighbours)
-        (sides,) = self.category_read(reasoned)
-        hidden = self.category(distance, self.pairs.by_agent(sides))
-        last = self.last
-        logits = functional.conv2d(hidden, last.get_buffer("weight"), last.get_buffer("bias"))
-        weights = logits.softmax(1)  # (B, R, 1, P)
-        biases = functional.conv2d(weights, last.get_buffer("of_layers")).split(self.width, 1)
-        return weights.expand(-1, -1, self.width, -1).flatten(1, 2).unsqueeze(2), biases
+        hidden = self.category(distance, self.pairs.by_agent(self.reread(reasoned)))
+        weights = self.last(hidden).softmax(-1)  # (B P, R)
+        biases = (weights @ self.get_buffer("biases")).split(self.width, 1)
+        return weights.unsqueeze(-1).expand(-1, -1, self.width).flatten(1), biases
 
 
 class FoldedLayer(nn.Module):
@@ -162,16 +160,16 @@ class FoldedLayer(nn.Module):
     def __init__(self, of: FeatureLearning, pairs: PairsOf) -> None:
         super().__init__()
         like, geometric = of.norm.weight, of.geometric
-        weights, biases = linears(geometric.attention)
-        biases[-1] = biases[-1] + 1.0  # what G is scaled by
+        first, *others, (weight, bias) = linears(geometric.attention)
+        others.append((weight, bias + 1.0))  # what G is scaled by
         self.norm, self.pairs = of.norm, pairs
-        self.attention = Rows(weights[1:], biases[1:], like=like, activated=True)
+        self.attention = Linears(others, like, activated=True)
         self.message = FoldedMessage(of.pattern.message, of.pattern.update)
         perceptrons = geometric.interaction, of.pattern.message
-        parts = [receiver_sender(*perceptrons), (weights[0], biases[0]), self.message.reads]
-        self.read = SideBySide(parts, like)
+        reads = [receiver_sender(*perceptrons), first, self.message.reads]
+        self.read = SideBySide(reads, like)
         self.geometric = FoldedGeometric(geometric, pairs)
-        self.sizes = [p.distance.weight.shape[0] * p.distance.weight.shape[2] for p in perceptrons]
+        self.sizes = [self.geometric.interaction.outputs, self.message.pairs.outputs]
 
     def forward(
         self,
@@ -181,12 +179,12 @@ class FoldedLayer(nn.Module):
         bias: Tensor,
         neighbours: Neighbours,
     ) -> tuple[Tensor, Tensor]:
-        """G (B, 2, N, C) and H (B N, D), both of `FoldedInteraction` -> the same two."""
+        """G (B, 2, N C) and H (B N, D), and both of `FoldedInteraction` -> the same two."""
         sides, attention, update = self.read(self.norm(pattern))
         of_interaction, of_message = self.pairs.by_agent(sides).split(self.sizes, 1)
         scale = self.attention(attention)
         geometric = self.geometric(geometric, scale, of_interaction, weights, bias, neighbours)
-        distance = distances(self.pairs.offsets(geometric))
+        distance = self.pairs.distances(geometric)
         return geometric, pattern + self.message(distance, of_message, update, neighbours)
 
 
@@ -195,10 +193,10 @@ class FoldedGeometric(Fixed):
 
     def __init__(self, of: GeometricLayer, pairs: PairsOf) -> None:
         super().__init__(of.step)
-        self.pairs, self.interaction = pairs, PairColumns(of.interaction)
+        self.pairs, self.interaction = pairs, PairRows(of.interaction)
         weight, _ = last_layer(of.interaction)  # (R, W, C)
-        self.keep(strength=weight.permute(2, 0, 1).flatten(1)[..., None, None])
-        self.nonlinearity = FoldedNonlinearity(of.nonlinearity, of.step)
+        self.keep(strength=weight.flatten(0, 1))
+        self.nonlinearity = FoldedNonlinearity(of.nonlinearity, of.step, pairs)
 
     def forward(
         self,
@@ -209,35 +207,33 @@ class FoldedGeometric(Fixed):
         bias: Tensor,
         neighbours: Neighbours,
     ) -> Tensor:
-        """G (B, 2, N, C), scaled by (B N, C) -> G."""
-        agents, channels = geometric.shape[2:]
-        flat = geometric.flatten(2)
-        around = (flat - flat @ neighbours.mean).unflatten(2, (agents, channels))
-        around = around * scale.view(-1, 1, agents, channels)
-        offset = self.pairs.offsets(around)  # (B, 2, C, P) from j to i
-        hidden = self.interaction(distances(offset), by_agent) * weights
-        strength = functional.conv2d(hidden, self.get_buffer("strength")) + bias  # (B, C, 1, P)
-        pull = offset * strength.transpose(1, 2)
-        around = around + neighbours.gather.unsqueeze(1) @ pull.transpose(2, 3)
-        return self.nonlinearity(around, geometric)
+        """G (B, 2, N C), scaled by (B N, C) -> G."""
+        flat = geometric.shape[0], 1, -1
+        around = (geometric - geometric @ neighbours.mean) * scale.view(flat)
+        offset = self.pairs.offsets(around)  # (B, 2, P C) from j to i
+        hidden = self.interaction(self.pairs.lengths(offset), by_agent) * weights
+        strength = torch.addmm(bias, hidden, self.get_buffer("strength"))  # (B P, C)
+        pull = self.pairs.per_pair(offset * strength.view(flat))
+        around = self.pairs.per_agent(around) + neighbours.gather.unsqueeze(1) @ pull
+        return geometric + self.nonlinearity(around)
 
 
 class FoldedNonlinearity(Fixed):
-    """`VectorNonlinearity`, times a factor for every channel, on top of other vectors."""
+    """`VectorNonlinearity`, times a factor for every channel."""
 
-    def __init__(self, of: VectorNonlinearity, factor: Tensor) -> None:
+    def __init__(self, of: VectorNonlinearity, factor: Tensor, pairs: PairsOf) -> None:
         super().__init__(factor)
-        # A negative factor turns the query over, and so whether it points against the key.
+        self.pairs = pairs
+        # A negative factor turns the query over, and so whether it points against its key.
         sign = torch.where(factor < 0.0, 1.0, -1.0).double()
-        self.keep(query=(of.query.weight.double().T * factor))
-        self.keep(against=(of.key.weight.double().T * sign))
+        self.keep(query=of.query.weight.double().T * factor, key=of.key.weight.double().T * sign)
 
-    def forward(self, vectors: Tensor, to: Tensor) -> Tensor:
-        """(B, 2, M, C) -> (B, 2, M, C)."""
-        query, key = vectors @ self.get_buffer("query"), vectors @ self.get_buffer("against")
-        along = (query * key).sum(1, keepdim=True).relu()  # (B, 1, M, C) does not turn
-        lost = along / ((key * key).sum(1, keepdim=True) + TINY) * key
-        return to + (query - lost)
+    def forward(self, vectors: Tensor) -> Tensor:
+        """(B, 2, N, C) -> (B, 2, N C)."""
+        query = (vectors @ self.get_buffer("query")).flatten(2)
+        key = (vectors @ self.get_buffer("key")).flatten(2)
+        against = self.pairs.dot(query, key).relu()  # (B, 1, N C) does not turn
+        return query - against / (self.pairs.dot(key, key) + TINY) * key
 
 
 class FoldedMessage(Fixed):
@@ -245,26 +241,21 @@ class FoldedMessage(Fixed):
 
     def __init__(self, of: PairPerceptron, update: nn.Sequential) -> None:
         super().__init__(of.distance.weight)
-        self.pairs = PairColumns(of)
+        self.pairs = PairRows(of)
         last, last_bias = last_layer(of)
-        weights, biases = linears(update)
-        message, pattern = weights[0].chunk(2, 1)
-        self.keep(of_sum=last[0] @ message.T, of_count=last_bias[:1] @ message.T)
-        self.reads = pattern, biases[0]
-        self.update = Rows(weights[1:], biases[1:], like=of.distance.weight, activated=True)
+        (weight, bias), *others = linears(update)
+        message, pattern = weight.chunk(2, 1)
+        self.keep(of_sum=last[0] @ message.T, of_count=last_bias @ message.T)
+        self.reads = pattern, bias
+        self.update = Linears(others, of.distance.weight, activated=True)
 
     def forward(
         self, distance: Tensor, by_agent: Tensor, update: Tensor, neighbours: Neighbours
     ) -> Tensor:
-        """Distances (B, C, 1, P); from the pattern features: by_agent, update (B N, D)."""
-        hidden = self.pairs(distance, by_agent).squeeze(2)  # (B, W, P)
-        received = (neighbours.gather @ hidden.transpose(1, 2)).flatten(0, 1)
+        """Distances (B P, C); from the pattern features: by_agent (B P, W), update (B N, D)."""
+        hidden = self.pairs(distance, by_agent)
+        by_pair = hidden.unflatten(0, (-1, neighbours.gather.shape[2]))  # (B, P, W)
+        received = (neighbours.gather @ by_pair).flatten(0, 1)
         update = torch.addmm(update, neighbours.count, self.get_buffer("of_count"))
         rows: Tensor = self.update(torch.addmm(update, received, self.get_buffer("of_sum")))
         return rows
-
-
-def distances(offset: Tensor) -> Tensor:
-    """Lengths (B, C, 1, P) of vectors (B, 2, C, P), as `layers.length`."""
-    squared = (offset * offset).sum(1, keepdim=True)
-    return (squared + TINY**2).sqrt().transpose(1, 2)

@@ -1,19 +1,24 @@
 """Weights multiplied out, and the layers that hold them.
 
-Rows are agents, (B N, D), and pass through linear layers. Pairs of agents are columns,
-(B, channels, 1, pairs), and pass through 1x1 convolutions: one operator for all R perceptrons of a
-layer side by side, bias included, and the pairs are contiguous.
+Whatever passes through linear layers are rows: of agents (B N, D), and of pairs of agents (B P, W).
+A runtime packs constant matrices for its kernels if they stand on the right of a product of two
+matrices; small constants that many layers share stand on the left, where they are not copied.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import permutations
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from eqrt.training.networks.eqmotion_layers import PairPerceptron
+from eqrt.training.networks.layers import TINY
+
+Affine = tuple[Tensor, Tensor]
+"""Weight (outputs, inputs) and bias (outputs,), in float64."""
 
 
 class Fixed(nn.Module):
@@ -29,130 +34,155 @@ class Fixed(nn.Module):
             self.register_buffer(name, value.detach().to(self._dtype).contiguous())
 
 
-class Rows(Fixed):
-    """Linear layers on rows, with SiLU between them (and before the first, if `activated`)."""
+class Linears(Fixed):
+    """Linear layers one after the other, with SiLU between them."""
 
-    def __init__(
-        self, weights: Sequence[Tensor], biases: Sequence[Tensor], *, like: Tensor, activated: bool
-    ) -> None:
-        """Weights (outputs, inputs) and biases (outputs,)."""
+    def __init__(self, layers: Sequence[Affine], like: Tensor, *, activated: bool = False) -> None:
+        """`activated`: SiLU also before the first."""
         super().__init__(like)
-        self.count, self.activated = len(weights), activated
-        for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        self.count, self.activated = len(layers), activated
+        for index, (weight, bias) in enumerate(layers):
             self.keep(**{f"weight{index}": weight, f"bias{index}": bias})
 
     def forward(self, rows: Tensor) -> Tensor:
         """(M, inputs) -> (M, outputs)."""
         for index in range(self.count):
+            weight, bias = self.get_buffer(f"weight{index}"), self.get_buffer(f"bias{index}")
             if index or self.activated:
                 rows = functional.silu(rows)
-            rows = functional.linear(
-                rows, self.get_buffer(f"weight{index}"), self.get_buffer(f"bias{index}")
-            )
+            rows = functional.linear(rows, weight, bias)
         return rows
 
 
-class PairColumns(Fixed):
+class SideBySide(Fixed):
+    """Linear layers that read the same rows, as one product."""
+
+    def __init__(self, layers: Sequence[Affine], like: Tensor) -> None:
+        super().__init__(like)
+        self.sizes = [len(bias) for _, bias in layers]
+        self.keep(weight=torch.cat([weight for weight, _ in layers]))
+        self.keep(bias=torch.cat([bias for _, bias in layers]))
+
+    def forward(self, rows: Tensor) -> tuple[Tensor, ...]:
+        """(M, D) -> of each layer (M, its outputs)."""
+        every = functional.linear(rows, self.get_buffer("weight"), self.get_buffer("bias"))
+        return every.split(self.sizes, 1)
+
+
+class PairRows(Fixed):
     """A `PairPerceptron` up to its last activation; what follows is linear, and folded elsewhere.
 
-    The first layer's part that reads pattern features comes from outside, `by_agent`: it is the same
-    for all pairs of an agent, so it is computed per agent, in one product with whatever else
+    The part of its first layer that reads pattern features comes from outside, `by_agent`: it is the
+    same for all pairs of an agent, so it is computed per agent, in one product with whatever else
     reads these (`receiver_sender`).
     """
 
     def __init__(self, of: PairPerceptron) -> None:
         super().__init__(of.distance.weight)
-        self.groups = of.distance.weight.shape[0]
-        self.keep(distance=columns(of.distance.weight))
-        self.hidden = len(of.rest) - 1
+        self.groups, _, width = of.distance.weight.shape
+        self.outputs, self.hidden = self.groups * width, len(of.rest) - 1
+        self.keep(distance=of.distance.weight.transpose(0, 1).flatten(1))  # (C, R W)
         for index, layer in enumerate(list(of.rest)[:-1]):
+            weight = layer.get_parameter("weight").transpose(1, 2).flatten(0, 1)  # (R W, W)
             bias = layer.get_parameter("bias").flatten()
-            weight = columns(layer.get_parameter("weight"))
             self.keep(**{f"weight{index}": weight, f"bias{index}": bias})
 
     def forward(self, distance: Tensor, by_agent: Tensor) -> Tensor:
-        """Distances (B, C, 1, pairs), by_agent (B, R W, 1, pairs) -> (B, R W, 1, pairs)."""
-        pairs = functional.conv2d(distance, self.get_buffer("distance")) + by_agent
+        """Distances (B P, C), by_agent (B P, R W) -> (B P, R W)."""
+        pairs = functional.silu(torch.addmm(by_agent, distance, self.get_buffer("distance")))
+        if self.groups > 1:
+            pairs = self._side_by_side(pairs)
+        else:
+            for index in range(self.hidden):
+                weight, bias = self.get_buffer(f"weight{index}"), self.get_buffer(f"bias{index}")
+                pairs = functional.silu(functional.linear(pairs, weight, bias))
+        return pairs
+
+    def _side_by_side(self, pairs: Tensor) -> Tensor:
+        """R perceptrons that do not mix, in one operator per layer: a grouped convolution."""
+        columns = pairs.view(1, 1, -1, self.outputs).permute(0, 3, 1, 2)  # (1, R W, 1, B P)
         for index in range(self.hidden):
             weight, bias = self.get_buffer(f"weight{index}"), self.get_buffer(f"bias{index}")
-            pairs = functional.conv2d(functional.silu(pairs), weight, bias, groups=self.groups)
-        return functional.silu(pairs)
+            columns = functional.silu(columns) if index else columns
+            columns = functional.conv2d(columns, weight[..., None, None], bias, groups=self.groups)
+        return functional.silu(columns.permute(0, 2, 3, 1).flatten(0, 2))
 
 
-def columns(grouped: Tensor) -> Tensor:
-    """Weights (R, inputs, outputs) of a `GroupedLinear` as those of a 1x1 convolution."""
-    return grouped.transpose(1, 2).flatten(0, 1)[..., None, None]
+class PairsOf(Fixed):
+    """The P = N (N - 1) ordered pairs of different agents, and vectors between them."""
+
+    sends: Tensor
+    """(N, P) 1 where the agent is the pair's sender."""
+    receives: Tensor
+    """(N, P)"""
+    difference: Tensor
+    """(P, N): receiver minus sender."""
+    alternating: Tensor
+    """(P, 2 N): row 2 i of the receiver, plus row 2 j + 1 of the sender."""
+    target: Tensor
+    """(N, 1): 1 where the agent is the target."""
+    both: Tensor
+    """(1, 2): adds what two coordinates give."""
+
+    def __init__(self, agents: int, like: Tensor) -> None:
+        super().__init__(like)
+        one_hot = torch.eye(agents, dtype=torch.float64)
+        sides = zip(*permutations(range(agents), 2), strict=True)
+        receives, sends = (one_hot[:, list(side)] for side in sides)
+        alternating = torch.stack([receives, sends], 1).flatten(0, 1).T
+        self.keep(receives=receives, sends=sends, difference=(receives - sends).T)
+        self.keep(alternating=alternating, target=one_hot[:, :1], both=torch.ones(1, 2))
+
+    def by_agent(self, rows: Tensor) -> Tensor:
+        """Rows (B N, 2 F) of `receiver_sender` -> their sums for every pair (B P, F)."""
+        per_side = rows.reshape(-1, self.alternating.shape[1], rows.shape[1] // 2)  # (B, 2 N, F)
+        return (self.alternating @ per_side).flatten(0, 1)
+
+    def per_agent(self, vectors: Tensor) -> Tensor:
+        """(B, 2, N C) -> (B, 2, N, C)."""
+        return vectors.unflatten(2, (self.difference.shape[1], -1))
+
+    def per_pair(self, vectors: Tensor) -> Tensor:
+        """(B, 2, P C) -> (B, 2, P, C)."""
+        return vectors.unflatten(2, (self.difference.shape[0], -1))
+
+    def offsets(self, geometric: Tensor) -> Tensor:
+        """From the sender to the receiver: (B, 2, N C) -> (B, 2, P C)."""
+        return (self.difference @ self.per_agent(geometric)).flatten(2)
+
+    def dot(self, one: Tensor, other: Tensor) -> Tensor:
+        """Inner products of vectors (B, 2, M): (B, 1, M)."""
+        return self.both @ (one * other)
+
+    def lengths(self, offsets: Tensor) -> Tensor:
+        """(B, 2, P C) -> (B P, C), as `layers.length`."""
+        channels = offsets.shape[2] // self.difference.shape[0]
+        return (self.dot(offsets, offsets) + TINY**2).sqrt().view(-1, channels)
+
+    def distances(self, geometric: Tensor) -> Tensor:
+        """(B, 2, N C) -> (B P, C)."""
+        return self.lengths(self.offsets(geometric))
 
 
-def receiver_sender(*perceptrons: PairPerceptron) -> tuple[Tensor, Tensor]:
-    """What `by_agent` is made from, for several: weights (2 sum(R W), D), and biases.
+def receiver_sender(*perceptrons: PairPerceptron) -> Affine:
+    """What agents contribute to the first layers of all their pairs, for several perceptrons.
 
-    First what every agent adds to the pairs that it receives in, then to those it sends in.
+    First what each adds to the pairs that it receives in, then to those that it sends in.
     """
     receivers = [p.receiver.weight.transpose(1, 2).flatten(0, 1) for p in perceptrons]
     senders = [p.sender.weight.transpose(1, 2).flatten(0, 1) for p in perceptrons]
-    biases = [p.receiver.get_parameter("bias").flatten() for p in perceptrons]
-    weight, bias = torch.cat([*receivers, *senders]), torch.cat(biases)
+    bias = torch.cat([p.receiver.get_parameter("bias").flatten() for p in perceptrons])
+    weight = torch.cat([*receivers, *senders])
     return weight.double(), torch.cat([bias, torch.zeros_like(bias)]).double()
 
 
-def last_layer(perceptron: PairPerceptron) -> tuple[Tensor, Tensor]:
-    """Weights (R, W, outputs) and biases (R, outputs) of what `PairColumns` leaves out."""
+def last_layer(perceptron: PairPerceptron) -> Affine:
+    """What `PairRows` leaves out: weights (R, W, outputs), biases (R, outputs)."""
     last = perceptron.rest[-1]
     return last.get_parameter("weight").double(), last.get_parameter("bias").flatten(1).double()
 
 
-def linears(sequence: nn.Sequential) -> tuple[list[Tensor], list[Tensor]]:
-    """Weights and biases of an `mlp`, in float64."""
+def linears(sequence: nn.Sequential) -> list[Affine]:
+    """The layers of an `mlp`, in float64."""
     layers = [layer for layer in sequence if isinstance(layer, nn.Linear)]
-    return [l.weight.double() for l in layers], [l.bias.double() for l in layers]
-
-
-class SideBySide(Fixed):
-    """Linear layers (weight, bias) that read the same rows, as one product."""
-
-    def __init__(self, parts: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> None:
-        super().__init__(like)
-        self.sizes = [len(bias) for _, bias in parts]
-        self.keep(weight=torch.cat([weight for weight, _ in parts]))
-        self.keep(bias=torch.cat([bias for _, bias in parts]))
-
-    def forward(self, rows: Tensor) -> tuple[Tensor, ...]:
-        """(M, D) -> of each layer (M, its outputs)."""
-        every = functional.linear(rows, self.get_buffer("weight"), self.get_buffer("bias"))
-        return every.split(self.sizes, 1) if len(self.sizes) > 1 else (every,)
-
-
-class PairsOf(Fixed):
-    """Constants over the P = N (N - 1) ordered pairs of different agents."""
-
-    receives: Tensor
-    """(N, P) 1 where the agent is the pair's receiver."""
-    sends: Tensor
-    """(N, P)"""
-    difference: Tensor
-    """(N, P): receiver minus sender."""
-    alternating: Tensor
-    """(2 N, P): adds row 2 i of the receiver and row 2 j + 1 of the sender."""
-
-    target: Tensor
-    """(N, 1): 1 where the agent is the target."""
-
-    def __init__(self, agents: int, like: Tensor) -> None:
-        super().__init__(like)
-        pairs = [(i, j) for i in range(agents) for j in range(agents) if i != j]
-        one_hot = torch.eye(agents, dtype=torch.float64)
-        receives, sends = (one_hot[:, list(side)] for side in zip(*pairs, strict=True))
-        alternating = torch.stack([receives, sends], 1).flatten(0, 1)
-        self.keep(receives=receives, sends=sends)
-        self.keep(difference=receives - sends, alternating=alternating, target=one_hot[:, :1])
-
-    def offsets(self, geometric: Tensor) -> Tensor:
-        """From the sender to the receiver: (B, 2, N, C) -> (B, 2, C, P)."""
-        return geometric.transpose(2, 3) @ self.difference
-
-    def by_agent(self, rows: Tensor) -> Tensor:
-        """Rows (B N, 2 F) of `receiver_sender` -> their sums per pair (B, F, 1, P)."""
-        twice_agents = self.alternating.shape[0]
-        per_side = rows.reshape(-1, twice_agents, rows.shape[1] // 2)  # (B, 2 N, F)
-        return (per_side.transpose(1, 2) @ self.alternating).unsqueeze(2)
+    return [(layer.weight.double(), layer.bias.double()) for layer in layers]

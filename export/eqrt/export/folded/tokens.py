@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from eqrt.export.folded.products import Fixed, Rows, linears
+from eqrt.export.folded.products import Fixed, Linears, linears
 from eqrt.training.networks.map_tokens import AttentionEncoder, TransformerEncoder
 
 QUERIES = 100
@@ -71,10 +71,10 @@ class FoldedAttention(Fixed):
         super().__init__(of.qkv.weight)
         query, key, value = of_points(of.qkv, torch.eye(3).double())
         self.means = PointMeans(query, key, 1, of.qkv.weight)
-        weights, biases = linears(of.perceptron)
-        by_point = weights[0].unflatten(1, (-1, len(value)))  # (D, P, W)
-        weights[0] = (by_point @ value).transpose(1, 2).flatten(1)  # (D, 3 P)
-        self.perceptron = Rows(weights, biases, like=of.qkv.weight, activated=False)
+        (weight, bias), *others = linears(of.perceptron)
+        by_point = weight.unflatten(1, (-1, len(value))) @ value  # (D, P, 3)
+        weight = by_point.transpose(1, 2).flatten(1)
+        self.perceptron = Linears([(weight, bias), *others], of.qkv.weight)
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
         """Points (B, P, 2), 0 where not valid (B, P) -> the map's feature (B, D)."""
@@ -99,11 +99,11 @@ class FoldedTransformer(Fixed):
         read = torch.cat([told[..., 0], told[..., 1], embed[:, :2].T])  # (2 heads + 2, W)
         self.keep(read=read, bias=told[..., 2].sum(0) + embed[:, 2] + of.project.bias)
         self._keep_feed_forward(of)
-        self.perceptron = Rows(*linears(of.perceptron), like=like, activated=False)
+        self.perceptron = Linears(linears(of.perceptron), like)
 
     def _keep_feed_forward(self, of: TransformerEncoder) -> None:
         """Its last bias is added with the first normalisation's, so that no operator is left."""
-        (widen, narrow), (bias, last) = linears(of.feed_forward)
+        (widen, bias), (narrow, last) = linears(of.feed_forward)
         self.keep(scale1=of.norm1.weight, shift1=of.norm1.bias + last)
         self.keep(widen=widen, widen_bias=bias - widen @ last, narrow=narrow.T)
         self.keep(scale2=of.norm2.weight, shift2=of.norm2.bias)
