@@ -86,49 +86,61 @@ class FoldedAttention(Fixed):
 
 
 class FoldedTransformer(Fixed):
-    """`TransformerEncoder`: what the first normalisation reads is linear in means and points."""
+    """`TransformerEncoder`.
+
+    What the first normalisation reads is linear in K = 2 heads + 3 numbers per point: the means, the
+    point, and 1. So it is they that are divided by the standard deviation, which is the length of a
+    product of theirs; and what follows reads them.
+    """
 
     def __init__(self, of: TransformerEncoder) -> None:
         super().__init__(of.embed.weight)
-        like = of.embed.weight
         embed = torch.cat([of.embed.weight, of.embed.bias.unsqueeze(1)], 1).double()  # (W, 3)
         query, key, value = of_points(of.qkv, homogeneous(embed))
-        self.means = PointMeans(query, key, of.heads, like)
+        self.means = PointMeans(query, key, of.heads, of.embed.weight)
         by_head = of.project.weight.double().unflatten(1, (of.heads, -1)).transpose(0, 1)
         told = by_head @ value.unflatten(0, (of.heads, -1))  # (heads, W, 3)
-        read = torch.cat([told[..., 0], told[..., 1], embed[:, :2].T])  # (2 heads + 2, W)
-        self.keep(read=read, bias=told[..., 2].sum(0) + embed[:, 2] + of.project.bias)
-        self._keep_feed_forward(of)
+        embed[:, 2] += told[..., 2].sum(0) + of.project.bias
+        self._keep_tokens(torch.cat([told[..., 0].T, told[..., 1].T, embed], 1), of)
         (weight, bias), *others = linears(of.perceptron)
         self.keep(first=weight, first_bias=bias)
-        self.perceptron = Linears(others, like, activated=True)
+        self.perceptron = Linears(others, of.embed.weight, activated=True)
 
-    def _keep_feed_forward(self, of: TransformerEncoder) -> None:
-        """Its last bias is added with the first normalisation's, so that no operator is left."""
+    def _keep_tokens(self, read: Tensor, of: TransformerEncoder) -> None:
+        """`read` (W, K): what makes that which the first normalisation reads."""
+        centred = read - read.mean(0)
+        deviation = torch.linalg.qr(centred / len(read) ** 0.5).R
+        self.keep(deviation=deviation, ones=torch.ones(1, len(deviation)))
+        token = of.norm1.weight.double().unsqueeze(1) * centred  # (W, K)
         (widen, bias), (narrow, last) = linears(of.feed_forward)
-        self.keep(scale1=of.norm1.weight, shift1=of.norm1.bias + last)
-        self.keep(widen=widen, widen_bias=bias - widen @ last, narrow=narrow.T)
-        self.keep(scale2=of.norm2.weight, shift2=of.norm2.bias)
+        self.keep(token=token, token_bias=of.norm1.bias + last)
+        self.keep(widen=widen @ token, widen_bias=widen @ of.norm1.bias.double() + bias)
+        self.keep(narrow=narrow.T, scale=of.norm2.weight, shift=of.norm2.bias)
         self.eps = of.norm1.eps, of.norm2.eps
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
         """Points (B, P, 2), 0 where not valid (B, P) -> the map's feature (B, D)."""
         columns = with_ones(points)
-        known = torch.cat([self.means(columns, valid.unsqueeze(1)), columns[:, :2]], 1)
-        tokens = known.transpose(1, 2) @ self.get_buffer("read") + self.get_buffer("bias")
-        tokens = self._norm("1", tokens.flatten(0, 1))  # (B P, W)
-        wide = functional.linear(tokens, self.get_buffer("widen"), self.get_buffer("widen_bias"))
-        tokens = torch.addmm(tokens, wide.relu(), self.get_buffer("narrow"))
+        known = torch.cat([self.means(columns, valid.unsqueeze(1)), columns], 1)  # (B, K, P)
+        tokens = self._tokens(known)  # (B P, W)
         seen = valid.reshape(-1, 1).to(points.dtype)
-        tokens = (self._norm("2", tokens) * seen).view(points.shape[0], -1, 1)
+        tokens = (tokens * seen).view(points.shape[0], -1, 1)
         # 4.6 M weights on the left, which a runtime reads as they are, once, at memory's speed.
         first = (self.get_buffer("first") @ tokens).squeeze(2) + self.get_buffer("first_bias")
         feature: Tensor = self.perceptron(first)
         return feature
 
-    def _norm(self, which: str, tokens: Tensor) -> Tensor:
-        scale, shift = self.get_buffer(f"scale{which}"), self.get_buffer(f"shift{which}")
-        return functional.layer_norm(tokens, scale.shape, scale, shift, self.eps[int(which) - 1])
+    def _tokens(self, known: Tensor) -> Tensor:
+        """(B, K, P) -> (B P, W)."""
+        of = self.get_buffer
+        deviation = of("deviation") @ known
+        variance = of("ones") @ (deviation * deviation)  # (B, 1, P)
+        rows = (known / (variance + self.eps[0]).sqrt()).transpose(1, 2).flatten(0, 1)
+        wide = functional.linear(rows, of("widen"), of("widen_bias")).relu()
+        token = functional.linear(rows, of("token"), of("token_bias"))
+        tokens = torch.addmm(token, wide, of("narrow"))
+        shape = of("scale").shape
+        return functional.layer_norm(tokens, shape, of("scale"), of("shift"), self.eps[1])
 
 
 def with_ones(points: Tensor) -> Tensor:
