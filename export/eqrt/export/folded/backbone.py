@@ -4,9 +4,9 @@
     pattern   (B N, D)     rows of agents
     pairs     (B P, .)     rows of the P = N (N - 1) pairs of different agents
 
-All that a layer reads from the pattern features is one product. From agents to pairs, and from pairs
-to those who receive, lead products with small matrices; masks are in these. The last layer of a
-perceptron is multiplied with the linear layer behind it.
+All that a layer reads from the pattern features is one product. From agents to pairs, and from
+pairs to those who receive, lead products with small matrices; masks are in these. The last layer of
+a perceptron is multiplied with the linear layer behind it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from eqrt.export.folded.products import (
     Fixed,
@@ -30,7 +29,7 @@ from eqrt.export.folded.products import (
 from eqrt.export.folded.tokens import folded_map
 from eqrt.training.networks.canonical import last_valid, masked
 from eqrt.training.networks.config import UNIT_M
-from eqrt.training.networks.eqmotion import EqMotion
+from eqrt.training.networks.eqmotion import EqMotion, read_map
 from eqrt.training.networks.eqmotion_layers import (
     Agents,
     FeatureLearning,
@@ -54,10 +53,18 @@ class Neighbours:
     """(B N, 1): of these."""
 
 
+@dataclass(frozen=True, slots=True)
+class Categories:
+    """Of all pairs: how much each counts, and what that makes of a layer's biases."""
+
+    weights: Tensor
+    """(B P, R W), the same for all W."""
+    bias: Tensor
+    """(B P, C) of one layer."""
+
+
 class FoldedEqMotion(nn.Module):
     """One of the paper's systems on EqMotion, for export."""
-
-    read_map = EqMotion.read_map
 
     def __init__(self, model: EqMotion, num_agents: int) -> None:
         super().__init__()
@@ -89,7 +96,7 @@ class FoldedEqMotion(nn.Module):
         map_points = self.frame(
             history[:, 0], history_valid[:, 0], heading, centerlines, centerlines_valid
         )
-        from_map, vectors = self.read_map(map_points)
+        from_map, vectors = read_map(self.map, self.fusion, map_points, in_metres=self.in_metres)
         features, rows = self.initial((held - origin) / UNIT_M, history_valid, agents, from_map)
         geometric = features.transpose(1, 2)  # (B, 2, N, C)
         if vectors is not None:
@@ -97,9 +104,9 @@ class FoldedEqMotion(nn.Module):
 
         neighbours = self._neighbours(agents, geometric.shape[-1])
         geometric, pattern = geometric.flatten(2), rows.flatten(0, 1)
-        weights, biases = self.interaction(geometric, pattern, neighbours)
-        for layer, bias in zip(self.layers, biases, strict=True):
-            geometric, pattern = layer(geometric, pattern, weights, bias, neighbours)
+        of_layers = self.interaction(geometric, pattern, neighbours)
+        for layer, categories in zip(self.layers, of_layers, strict=True):
+            geometric, pattern = layer(geometric, pattern, categories, neighbours)
         return self._decode(geometric, pattern, origin, neighbours)
 
     def _neighbours(self, agents: Agents, channels: int) -> Neighbours:
@@ -123,7 +130,7 @@ class FoldedEqMotion(nn.Module):
 
 
 class FoldedInteraction(Fixed):
-    """Categories of all pairs; and what they make of the layers' biases, which no layer changes."""
+    """`InteractionReasoning`, and what the categories make of the layers' biases: no layer does."""
 
     def __init__(
         self, of: InteractionReasoning, pairs: PairsOf, layers: list[FeatureLearning]
@@ -143,15 +150,16 @@ class FoldedInteraction(Fixed):
 
     def forward(
         self, geometric: Tensor, pattern: Tensor, neighbours: Neighbours
-    ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Category weights (B P, R W), the same for all W, and each layer's bias (B P, C)."""
+    ) -> list[Categories]:
+        """G (B, 2, N C) and H (B N, D) -> the categories, for each layer."""
         distance = self.pairs.distances(geometric)
         sides, update = self.read(pattern)
         reasoned = self.message(distance, self.pairs.by_agent(sides), update, neighbours)
         hidden = self.category(distance, self.pairs.by_agent(self.reread(reasoned)))
         weights = self.last(hidden).softmax(-1)  # (B P, R)
-        biases = (weights @ self.get_buffer("biases")).split(self.width, 1)
-        return weights.unsqueeze(-1).expand(-1, -1, self.width).flatten(1), biases
+        biases = torch.split(weights @ self.get_buffer("biases"), self.width, 1)
+        by_width = weights.unsqueeze(-1).expand(-1, -1, self.width).flatten(1)
+        return [Categories(by_width, bias) for bias in biases]
 
 
 class FoldedLayer(nn.Module):
@@ -175,15 +183,14 @@ class FoldedLayer(nn.Module):
         self,
         geometric: Tensor,
         pattern: Tensor,
-        weights: Tensor,
-        bias: Tensor,
+        categories: Categories,
         neighbours: Neighbours,
     ) -> tuple[Tensor, Tensor]:
-        """G (B, 2, N C) and H (B N, D), and both of `FoldedInteraction` -> the same two."""
+        """G (B, 2, N C) and H (B N, D) -> the same two."""
         sides, attention, update = self.read(self.norm(pattern))
-        of_interaction, of_message = self.pairs.by_agent(sides).split(self.sizes, 1)
+        of_interaction, of_message = torch.split(self.pairs.by_agent(sides), self.sizes, 1)
         scale = self.attention(attention)
-        geometric = self.geometric(geometric, scale, of_interaction, weights, bias, neighbours)
+        geometric = self.geometric(geometric, scale, of_interaction, categories, neighbours)
         distance = self.pairs.distances(geometric)
         return geometric, pattern + self.message(distance, of_message, update, neighbours)
 
@@ -203,19 +210,19 @@ class FoldedGeometric(Fixed):
         geometric: Tensor,
         scale: Tensor,
         by_agent: Tensor,
-        weights: Tensor,
-        bias: Tensor,
+        categories: Categories,
         neighbours: Neighbours,
     ) -> Tensor:
         """G (B, 2, N C), scaled by (B N, C) -> G."""
         flat = geometric.shape[0], 1, -1
         around = (geometric - geometric @ neighbours.mean) * scale.view(flat)
         offset = self.pairs.offsets(around)  # (B, 2, P C) from j to i
-        hidden = self.interaction(self.pairs.lengths(offset), by_agent) * weights
-        strength = torch.addmm(bias, hidden, self.get_buffer("strength"))  # (B P, C)
+        hidden = self.interaction(self.pairs.lengths(offset), by_agent) * categories.weights
+        strength = torch.addmm(categories.bias, hidden, self.get_buffer("strength"))  # (B P, C)
         pull = self.pairs.per_pair(offset * strength.view(flat))
         around = self.pairs.per_agent(around) + neighbours.gather.unsqueeze(1) @ pull
-        return geometric + self.nonlinearity(around)
+        moved: Tensor = geometric + self.nonlinearity(around)
+        return moved
 
 
 class FoldedNonlinearity(Fixed):

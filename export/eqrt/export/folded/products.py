@@ -66,15 +66,15 @@ class SideBySide(Fixed):
     def forward(self, rows: Tensor) -> tuple[Tensor, ...]:
         """(M, D) -> of each layer (M, its outputs)."""
         every = functional.linear(rows, self.get_buffer("weight"), self.get_buffer("bias"))
-        return every.split(self.sizes, 1)
+        return torch.split(every, self.sizes, 1)
 
 
 class PairRows(Fixed):
     """A `PairPerceptron` up to its last activation; what follows is linear, and folded elsewhere.
 
-    The part of its first layer that reads pattern features comes from outside, `by_agent`: it is the
-    same for all pairs of an agent, so it is computed per agent, in one product with whatever else
-    reads these (`receiver_sender`).
+    The part of its first layer that reads pattern features comes from outside, `by_agent`: it is
+    the same for all pairs of an agent, so it is computed per agent, in one product with whatever
+    else reads these (`receiver_sender`).
     """
 
     def __init__(self, of: PairPerceptron) -> None:
@@ -140,11 +140,11 @@ class PairsOf(Fixed):
 
     def per_agent(self, vectors: Tensor) -> Tensor:
         """(B, 2, N C) -> (B, 2, N, C)."""
-        return vectors.unflatten(2, (self.difference.shape[1], -1))
+        return vectors.view(vectors.shape[0], 2, self.difference.shape[1], -1)
 
     def per_pair(self, vectors: Tensor) -> Tensor:
         """(B, 2, P C) -> (B, 2, P, C)."""
-        return vectors.unflatten(2, (self.difference.shape[0], -1))
+        return vectors.view(vectors.shape[0], 2, self.difference.shape[0], -1)
 
     def offsets(self, geometric: Tensor) -> Tensor:
         """From the sender to the receiver: (B, 2, N C) -> (B, 2, P C)."""

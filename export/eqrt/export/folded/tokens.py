@@ -55,7 +55,7 @@ class PointMeans(Fixed):
         keys = torch.cat([points[:, :2], hidden], 1)
         x, y = points[:, 0].unsqueeze(2), points[:, 1].unsqueeze(2)  # (B, P, 1)
         means: tuple[list[Tensor], list[Tensor]] = ([], [])
-        for some in queries.split(QUERIES, 1):
+        for some in torch.split(queries, QUERIES, 1):
             share = (some @ keys).softmax(-1)
             # Two products with a vector: with a matrix of two columns, one would cost four times
             # as much.
@@ -72,7 +72,7 @@ class FoldedAttention(Fixed):
         query, key, value = of_points(of.qkv, torch.eye(3).double())
         self.means = PointMeans(query, key, 1, of.qkv.weight)
         (weight, bias), *others = linears(of.perceptron)
-        by_point = weight.unflatten(1, (-1, len(value))) @ value  # (D, P, 3)
+        by_point = weight.view(len(weight), -1, len(value)) @ value  # (D, P, 3)
         weight = by_point.transpose(1, 2).flatten(1)
         self.perceptron = Linears([(weight, bias), *others], of.qkv.weight)
 
@@ -88,9 +88,9 @@ class FoldedAttention(Fixed):
 class FoldedTransformer(Fixed):
     """`TransformerEncoder`.
 
-    What the first normalisation reads is linear in K = 2 heads + 3 numbers per point: the means, the
-    point, and 1. So it is they that are divided by the standard deviation, which is the length of a
-    product of theirs; and what follows reads them.
+    What the first normalisation reads is linear in K = 2 heads + 3 numbers per point: the means,
+    the point, and 1. So it is they that are divided by the standard deviation, which is the length
+    of a product of theirs; and what follows reads them.
     """
 
     def __init__(self, of: TransformerEncoder) -> None:
@@ -98,8 +98,8 @@ class FoldedTransformer(Fixed):
         embed = torch.cat([of.embed.weight, of.embed.bias.unsqueeze(1)], 1).double()  # (W, 3)
         query, key, value = of_points(of.qkv, homogeneous(embed))
         self.means = PointMeans(query, key, of.heads, of.embed.weight)
-        by_head = of.project.weight.double().unflatten(1, (of.heads, -1)).transpose(0, 1)
-        told = by_head @ value.unflatten(0, (of.heads, -1))  # (heads, W, 3)
+        by_head = of.project.weight.double().view(len(value), of.heads, -1).transpose(0, 1)
+        told = by_head @ value.view(of.heads, -1, 3)  # (heads, W, 3)
         embed[:, 2] += told[..., 2].sum(0) + of.project.bias
         self._keep_tokens(torch.cat([told[..., 0].T, told[..., 1].T, embed], 1), of)
         (weight, bias), *others = linears(of.perceptron)
@@ -154,6 +154,6 @@ def homogeneous(linear: Tensor) -> Tensor:
 
 
 def of_points(qkv: nn.Linear, tokens: Tensor) -> tuple[Tensor, ...]:
-    """Query, key and value, each (W, 3), of (x, y, 1); `tokens` (inputs + 1, 3) are what qkv reads."""
+    """Query, key and value, each (W, 3), of (x, y, 1); qkv reads `tokens` (inputs + 1, 3)."""
     whole = torch.cat([qkv.weight, qkv.bias.unsqueeze(1)], 1).double()
     return (whole @ tokens).chunk(3)
