@@ -9,10 +9,10 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint bench figures clean
+.PHONY: help demo test test-runtime lint conformance conformance-table bench figures clean
 
 help: ## list what can be made
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 16
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: $(RUNTIME_VENV)/.installed ## see it work: recorded traffic over CAN, predicted and scored
 	@$(RUNTIME_VENV)/bin/eqrt demo
@@ -29,6 +29,12 @@ lint: $(VENV)/.installed ## check format, style, types, and who imports whom
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
+conformance: $(RUNTIME_VENV)/.installed ## run the shipped models in other runtimes and stacks (deploy/examples)
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m conformance.run
+
+conformance-table: $(RUNTIME_VENV)/.installed ## the same, and write what was found into docs/conformance.md
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m conformance.run --write
+
 bench: $(VENV)/.installed ## measure against the budgets; wants a quiet machine
 	$(VENV)/bin/python -m pytest --benchmark-enable --benchmark-only tests/bench
 
@@ -36,7 +42,8 @@ figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, mea
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/figures.py
 
 clean: ## remove the environments and everything else that was made here
-	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis
+	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis .conformance
+	rm -rf deploy/examples/build deploy/examples/javascript/node_modules
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp `.installed` in an environment is as old as the environment's last update.

@@ -73,6 +73,23 @@ FLAWS: dict[str, list[Node]] = {
 """What is done to the displacement per step, `steady` (B, 2), on its way to `flawed`."""
 
 
+_ENDS: dict[int, list[Node]] = {
+    1: [
+        ("Unsqueeze", ["path", "axis"], "trajectories", {}),
+        ("Mul", ["certain", "sure"], "probabilities", {}),
+    ],
+    2: [
+        ("Sub", ["start", "course"], "way_back", {}),
+        ("Unsqueeze", ["path", "axis"], "on", {}),
+        ("Unsqueeze", ["way_back", "axis"], "back", {}),
+        ("Concat", ["on", "back"], "trajectories", {"axis": 1}),
+        ("Mul", ["certain", "sure"], "half", {}),
+        ("Concat", ["half", "half"], "probabilities", {"axis": 1}),
+    ],
+}
+"""By the number of modes. Two are as probable as each other: on as before, and back."""
+
+
 def write_handmade(
     folder: Path,
     *,
@@ -85,7 +102,7 @@ def write_handmade(
 ) -> Path:
     """Write the artifact, complete with test vectors and checksums.
 
-    sure: what the only probability is. batch: the only number of targets, if not any.
+    sure: what every probability is. batch: the only number of targets, if not any.
     """
     folder.mkdir(parents=True)
     text = contract.to_json()
@@ -191,11 +208,17 @@ def _model(
         ("Mul", ["step", "steps"], "course", {}),
         ("Unsqueeze", ["now", "axis"], "start", {}),
         ("Add", ["start", "course"], "path", {}),
-        ("Unsqueeze", ["path", "axis"], "trajectories", {}),
         ("Gather", ["seen", "last_step"], "exists", {"axis": 1}),
         ("Cast", ["exists"], "certain", {"to": 1}),
-        ("Mul", ["certain", "sure"], "probabilities", {}),
+        *_ENDS[contract.num_modes],
     ]
+    if contract.covariances:
+        constants["circle"] = 4.0 * np.eye(2, dtype=np.float32)
+        nodes += [
+            ("Unsqueeze", ["trajectories", "end"], "places", {}),
+            ("Mul", ["places", "nothing"], "nowhere", {}),
+            ("Add", ["nowhere", "circle"], "covariances", {}),
+        ]
     graph = b"".join(_nested(1, _node(*node)) for node in nodes) + _text(2, "handmade")
     graph += b"".join(_nested(5, tensor(name, values)) for name, values in constants.items())
     for field, specs in ((11, contract.inputs), (12, contract.outputs)):

@@ -163,6 +163,14 @@ def test_the_file_is_what_old_and_small_runtimes_load(artifact: Path) -> None:
     assert not any(tensor.external_data for tensor in proto.graph.initializer)
 
 
+def test_what_depends_on_weights_alone_was_computed_when_exporting(artifact: Path) -> None:
+    """Every operator has something of the scene to work on."""
+    graph = onnx.load(artifact / "model.onnx").graph
+    constant = {"", *(tensor.name for tensor in graph.initializer)}
+    assert graph.node
+    assert not [node.name for node in graph.node if constant.issuperset(node.input)]
+
+
 @pytest.mark.parametrize("folder", [DEFAULT_ARTIFACT, None], ids=["shipped", "exported"])
 def test_nothing_of_the_exporting_machine_is_in_the_file(
     folder: Path | None, artifact: Path
@@ -398,6 +406,6 @@ def test_a_failed_export_leaves_the_old_artifact_alone(
     before = (copy / "SHA256SUMS").read_bytes()
     monkeypatch.setattr("eqrt.export.artifact.AGREEMENT_M", -1.0)  # nothing agrees that well
     with pytest.raises(EqrtError, match="differ"):
-        write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy)
+        write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy, "Other weights.")
     assert (copy / "SHA256SUMS").read_bytes() == before
     assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]

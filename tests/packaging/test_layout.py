@@ -71,6 +71,7 @@ def test_types_are_checked_in_every_source_root_and_in_the_tests(tmp_path: Path)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     planted = [tmp_path / root / "eqrt" / root / "planted.py" for root in SOURCE_ROOTS]
     planted += [tmp_path / "runtime/eqrt/core/planted.py", tmp_path / "tests/core/test_planted.py"]
+    planted.append(tmp_path / "deploy/examples/python/planted.py")
     for path in planted:
         path.parent.mkdir(parents=True)
         path.write_text('steps: int = "three"\n')

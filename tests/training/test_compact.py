@@ -23,7 +23,7 @@ from eqrt.export.vectors import (
 )
 from eqrt.training.losses import best_mode_loss, spread_loss
 from eqrt.training.networks.canonical import canonical_from_tile
-from eqrt.training.networks.compact import CompactConfig, CompactPredictor
+from eqrt.training.networks.compact import CompactConfig, CompactPredictor, ModeLayer
 from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.registry import ModelConfig
 from eqrt.training.networks.spread import FLOOR_M, START_M, START_MPS
@@ -238,6 +238,33 @@ def test_the_printed_sign_of_the_rotation_would_not_be_invariant(
     assert np.abs(after - pose.apply(before)).max() > 1e-3
 
 
+def test_a_layer_is_the_usual_attention_although_it_computes_no_keys_and_no_values() -> None:
+    """Against torch's own multi-head attention with the same weights."""
+    torch.manual_seed(3)
+    layer = ModeLayer(CONFIG).double().eval()
+    queries, tokens = torch.randn(4, 3, 24).double(), torch.randn(4, 7, 24).double()
+    missing = torch.rand(4, 7) < 0.4
+    missing[:, 0] = False
+    told = layer(
+        queries.flatten(0, 1),
+        tokens,
+        tokens.transpose(1, 2),
+        -1e9 * missing.unsqueeze(1).double(),
+    )
+    usual = torch.nn.MultiheadAttention(24, CONFIG.heads, batch_first=True).double()
+    weights = [layer.query.weight, layer.key.weight, layer.value.weight]
+    with torch.no_grad():
+        usual.in_proj_weight.copy_(torch.cat(weights))
+        usual.in_proj_bias.zero_()
+        usual.in_proj_bias[:24] = layer.query.bias
+        usual.out_proj.weight.copy_(layer.project.weight)
+        usual.out_proj.bias.zero_()
+        attended, _ = usual(layer.norm1(queries), tokens, tokens, key_padding_mask=missing)
+        expected = queries + attended
+        expected = expected + layer.narrow(layer.widen(layer.norm2(expected)))
+    torch.testing.assert_close(told, expected.flatten(0, 1))
+
+
 def test_a_slowly_stopping_target_is_predicted_without_a_jump(model: CompactPredictor) -> None:
     """Between driving, crawling and standing the expected end moves, but nowhere jumps.
 
@@ -432,6 +459,7 @@ def test_covariances_come_in_the_order_of_their_modes(
     """Without probabilities that differ, modes stay as they are drawn: the same pairs are there."""
     model, scene = variants["uncertain"], SCENES["driving"]
     sorted_modes = outputs(model, scene)
+    assert model.modes.logit is not None
     with torch.no_grad():
         last = list(model.modes.logit.parameters())[-2]
         monkeypatch.setattr(last, "data", -last.data)  # the least probable first

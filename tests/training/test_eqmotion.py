@@ -241,7 +241,8 @@ def facing(name: str, scene: Scene, heading: tuple[float, float] = (0.0, 0.0)) -
         torch.from_numpy(scene.centerlines),
         torch.from_numpy(scene.centerlines_valid),
     )
-    return seen.tile_from_frame[0, :, 0]
+    x_axis: Tensor = seen.tile_from_frame[0, :, 0]
+    return x_axis
 
 
 def with_track(x: list[float], y: list[float]) -> Scene:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -20,6 +19,8 @@ from torch import nn
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
+from eqrt.export.changelog import changelog
+from eqrt.export.model_card import model_card
 from eqrt.export.to_onnx import to_onnx
 from eqrt.export.vectors import TURNED, TWINS, named_scenes
 from eqrt.runtime.prediction.predictor import Predictor, disagreement
@@ -27,20 +28,22 @@ from eqrt.training.checkpoint import Card
 
 AGREEMENT_M = 1e-3
 """PyTorch and the file must agree within a millimetre (`disagreement`)."""
-EQUIVARIANT_M = 5e-3
-"""What turning a scene 500 m away may change by float32's rounding."""
 
 Tensors = Mapping[str, NDArray[np.float32]]
 """A network's outputs by the contract's names."""
 
 
-def write_artifact(model: nn.Module, contract: ModelContract, card: Card, folder: Path) -> float:
+def write_artifact(
+    model: nn.Module, contract: ModelContract, card: Card, folder: Path, changes: str | None = None
+) -> float:
     """Export `model`, verify it, and put it at `folder` (replacing an artifact there).
 
-    Returns the largest disagreement between PyTorch and the file in metres. Raises EqrtError if
-    that is above AGREEMENT_M or the runtime's own Predictor refuses the result, ValueError if the
-    model's outputs are not the contract's.
+    `changes` says what is new in this version (`eqrt.export.changelog`). Returns the largest
+    disagreement between PyTorch and the file in metres. Raises EqrtError if that is above
+    AGREEMENT_M or the runtime's own Predictor refuses the result, ValueError if the model's outputs
+    are not the contract's.
     """
+    log = changelog(folder, contract.version, changes)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
         draft = Path(temporary) / folder.name
@@ -54,8 +57,9 @@ def write_artifact(model: nn.Module, contract: ModelContract, card: Card, folder
         expected = {name: _expected(model, contract, scene) for name, scene in scenes.items()}
         (draft / "model.onnx").write_bytes(to_onnx(model, contract, metadata))
         (draft / "contract.json").write_text(contract.to_json() + "\n", encoding="utf-8")
-        text = _model_card(contract, card, _turned_apart_m(expected))
+        text = model_card(contract, card, _turned_apart_m(expected))
         (draft / "README.md").write_text(text, encoding="utf-8")
+        (draft / "CHANGELOG.md").write_text(log, encoding="utf-8")
         for index, (name, scene) in enumerate(scenes.items()):
             _write_vector(scene, expected[name], draft / f"test_data_set_{index}", name)
         _write_checksums(draft)
@@ -107,36 +111,6 @@ def _write_vector(scene: Scene, outputs: Tensors, folder: Path, name: str) -> No
     (folder / "name.txt").write_text(name + "\n", encoding="utf-8")
 
 
-def _anywhere(command: str) -> str:
-    """A command line without the folders of the machine that it ran on."""
-    return re.sub(r"(?<=\s)\S*/(?=\S)", "", command)
-
-
-def _metric(name: str) -> str:
-    """How a table calls a metric: `ade_3s` is ADE 3 s."""
-    if of_mean := re.fullmatch(r"(ade|fde)_(\d+)s", name):
-        return f"{of_mean[1].upper()} {of_mean[2]} s"
-    if ellipse := re.fullmatch(r"inside_(\d+)", name):
-        return f"truth inside the {ellipse[1]} % ellipse, share"
-    others = {"min_ade": "minADE", "min_fde": "minFDE", "miss_rate": "miss rate, share"}
-    return (others | {"nll": "NLL, nats"})[name]
-
-
-def _number(value: float | None) -> str:
-    """Constant velocity does not say how sure it is."""
-    return "" if value is None else f"{value:.3f}"
-
-
-def _what_counts(contract: ModelContract) -> str:
-    known = "; NLL and ellipses of the end" if contract.covariances else ""
-    if contract.num_modes == 1:
-        return f"mean and final displacement of the trajectory{known}"
-    return (
-        "ADE and FDE of the most probable trajectory; minADE, minFDE and miss rate of the best of "
-        f"{contract.num_modes}{known}"
-    )
-
-
 def _write_tensor(path: Path, name: str, value: NDArray[Any]) -> None:
     proto = onnx.numpy_helper.from_array(np.ascontiguousarray(value), name)
     path.write_bytes(proto.SerializeToString(deterministic=True))
@@ -161,51 +135,3 @@ def _turned_apart_m(expected: Mapping[str, Tensors]) -> float:
             for twin, scene in TWINS.items()
         )
     )
-
-
-def _model_card(contract: ModelContract, card: Card, turned_apart_m: float) -> str:
-    """The text; `turned_apart_m` as `_turned_apart_m` measures it."""
-    rows = "".join(
-        f"| {_metric(name)} | {value:.3f} | {_number(card.baseline.get(name))} |\n"
-        for name, value in card.metrics.items()
-    )
-    tensors = "".join(
-        f"| `{name}` | {kind} | ({', '.join(map(str, shape))}) |\n"
-        for name, (kind, shape) in (contract.inputs | contract.outputs).items()
-    )
-    turning = (
-        "turning or shifting that frame turns or shifts the prediction and nothing else"
-        if turned_apart_m < EQUIVARIANT_M
-        else f"the model is not equivariant: where the test vectors are turned, it predicts up to "
-        f"{turned_apart_m:.2g} m off"
-    )
-    modes = f"{contract.num_modes} trajectories" if contract.num_modes > 1 else "one trajectory"
-    return f"""# {contract.name} {contract.version}
-
-Predicts where traffic goes: for each target, its history and its neighbours' and the lane
-centerlines around it become {modes} of {contract.horizon_steps * contract.dt_s:g} s.
-
-| | |
-| --- | --- |
-| data | {card.data} |
-| licence of the weights | {card.license}{", non-commercial" if card.non_commercial else ""} |
-| parameters | {card.parameters} |
-| trained by | `{_anywhere(card.command)}`, {card.steps} steps, seed {card.seed} |
-| its configuration | SHA-256 {card.config_sha256[:16]} |
-| contract | version 1, `contract.json` |
-| check | `sha256sum -c SHA256SUMS`; `test_data_set_*` hold inputs and expected outputs |
-
-Errors on held-out recordings, metres ({_what_counts(contract)}):
-
-| metric | this model | constant velocity |
-| --- | --- | --- |
-{rows}
-| tensor | type | shape |
-| --- | --- | --- |
-{tensors}
-All positions are metres in one local frame (x east, y north) whose origin lies within 1 km of the
-car; {turning}.
-
-Limits: it knows vehicles on roads like those in its data; not pedestrians or cyclists, nor other
-countries' roads. It predicts what usually happens; it is no guarantee of what will.
-"""

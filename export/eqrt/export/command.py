@@ -14,6 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", type=Path, help="model.safetensors of `eqrt train`")
     parser.add_argument("--out", type=Path, required=True, help="folder of the artifact")
     parser.add_argument("--model-version", default="1.0.0", help="default 1.0.0")
+    parser.add_argument(
+        "--changes", metavar="TEXT", help="what this version changes, for its CHANGELOG.md"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -21,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = load_checkpoint(args.checkpoint)
     model, card = checkpoint.network, checkpoint.card
     contract = checkpoint.config.contract(card.name, args.model_version)
-    error = write_artifact(model, contract, card, args.out)
+    error = write_artifact(model, contract, card, args.out, args.changes)
     size = (args.out / "model.onnx").stat().st_size
     print(f"artifact       {args.out}")
     print(f"model          {contract.name} {contract.version}, {card.parameters} parameters")

@@ -58,7 +58,8 @@ def unit(vectors: Tensor) -> Tensor:
 
 def length(vectors: Tensor) -> Tensor:
     """Lengths (..., 1) of vectors (..., 2)."""
-    return torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    lengths: Tensor = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return lengths
 
 
 class LaneDirection(nn.Module):

@@ -206,8 +206,8 @@ class ModeLayer(nn.Module):
     """Attention of the modes to the tokens, and a perceptron, each added to what was there.
 
     It is the usual attention, multiplied out for few queries, often one, and many tokens: a key's
-    product with a query is the token's product with a row of W, and what a head returns is a mean of
-    tokens. So keys and values are never computed; their weights are folded into those before and
+    product with a query is the token's product with a row of W, and what a head returns is a mean
+    of tokens. So keys and values are never computed; their weights are folded into those before and
     after, once, when the network is exported.
     """
 

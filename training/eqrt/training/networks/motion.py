@@ -25,6 +25,8 @@ class FittedMotion:
 
     last: Tensor
     """(B, 2, N, 1) metres, where each agent was last seen; 0 for one that never was."""
+    relative: Tensor
+    """(B, 2, N, T) metres, where it was before, from there; 0 where not seen."""
     velocity: Tensor
     """(B, 2, N, S) m/s, fitted over SLOPE_STEPS."""
     vectors: tuple[Tensor, ...]
@@ -76,7 +78,7 @@ class MotionFit(nn.Module):
         off_course = (relative - course * self.time) * valid
         both = (valid @ self.neighbours - 1.0).relu()
         change = (off_course @ self.change) * both
-        return FittedMotion(last, velocity, (off_course, change, velocity - course))
+        return FittedMotion(last, relative, velocity, (off_course, change, velocity - course))
 
     def _slopes(self, relative: Tensor, valid: Tensor) -> Tensor:
         """Least-squares velocities (B, 2, N, S) over the seen steps of each window; 0 for one."""

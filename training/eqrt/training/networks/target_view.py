@@ -52,9 +52,9 @@ class TargetView(nn.Module):
         self.heading, self.frame, self.tokens = heading, frame, tokens
         self.motion = MotionFit(scene)
         self.lane_direction = LaneDirection(scene.centerline_points)
-        slopes, vectors = len(SLOPE_STEPS), fitted_vectors(scene)
+        steps, slopes, vectors = scene.history_steps, len(SLOPE_STEPS), fitted_vectors(scene)
         near, far = [1.0], [1.0 / UNIT_M]  # metres of deviation, and tens of metres of place
-        self.of_agent = 2 * (near * vectors + far * (slopes + 1)) + near * scene.history_steps
+        self.of_agent = 2 * (near * vectors + far * (steps + slopes + 1)) + near * steps
         """What brings each number of an agent to about 1."""
         points = scene.centerline_points
         of_line = 2 * points * far + points * near
@@ -82,7 +82,8 @@ class TargetView(nn.Module):
         lane = self.lane_direction(points, points_valid)
         turn = self._turn(places, history_valid, heading, motion.velocity, lane)
 
-        vectors = torch.cat([*motion.vectors, motion.velocity, motion.last - origin], -1)
+        place = motion.last - origin
+        vectors = torch.cat([*motion.vectors, motion.relative, motion.velocity, place], -1)
         lanes, lanes_valid = self._lanes(points, points_valid, turn)
         exists = valid.amax(-1)  # (B, 1, N)
         return Seen(
