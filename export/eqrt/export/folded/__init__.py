@@ -14,7 +14,7 @@ from eqrt.training.networks.eqmotion import EqMotion
 
 
 def folded(model: nn.Module, num_agents: int) -> nn.Module:
-    """What to export in place of `model`, which keeps its parameters: a copy, not a view."""
+    """What to export in place of `model`, which stays as it is."""
     if isinstance(model, EqMotion) and num_agents > 1:  # the form is one of pairs of agents
         return FoldedEqMotion(model, num_agents)
     return model

@@ -90,12 +90,11 @@ class PairRows(Fixed):
     def forward(self, distance: Tensor, by_agent: Tensor) -> Tensor:
         """Distances (B P, C), by_agent (B P, R W) -> (B P, R W)."""
         pairs = functional.silu(torch.addmm(by_agent, distance, self.get_buffer("distance")))
-        if self.groups > 1:
-            pairs = self._side_by_side(pairs)
-        else:
-            for index in range(self.hidden):
-                weight, bias = self.get_buffer(f"weight{index}"), self.get_buffer(f"bias{index}")
-                pairs = functional.silu(functional.linear(pairs, weight, bias))
+        if self.groups > 1 and self.hidden:
+            return self._side_by_side(pairs)
+        for index in range(self.hidden):
+            weight, bias = self.get_buffer(f"weight{index}"), self.get_buffer(f"bias{index}")
+            pairs = functional.silu(functional.linear(pairs, weight, bias))
         return pairs
 
     def _side_by_side(self, pairs: Tensor) -> Tensor:
