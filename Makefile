@@ -35,7 +35,7 @@ conformance: $(RUNTIME_VENV)/.installed ## run the shipped models in other runti
 conformance-table: $(RUNTIME_VENV)/.installed ## the same, and write what was found into docs/conformance.md
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m conformance.run --write
 
-bench: $(VENV)/.installed ## measure against the budgets; wants a quiet machine
+bench: $(VENV)/.installed ## measure against the budgets, in 9 minutes; wants a quiet machine
 	$(VENV)/bin/python -m pytest --benchmark-enable --benchmark-only tests/bench
 
 figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, measured; wants it quiet

@@ -1,14 +1,22 @@
-"""Reports of benchmarks that were never run: every sample is the same unless said otherwise."""
+"""Reports of benchmarks that were never run, every sample the same unless said otherwise; and of
+benchmarks run as a user runs them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
+from eqrt import cli
+from eqrt.runtime.bench import command
 from eqrt.runtime.bench.cold_start import ColdStart
 from eqrt.runtime.bench.environment import Environment, ModelIdentity
+from eqrt.runtime.bench.json_form import read_json
 from eqrt.runtime.bench.measure import Measurement, results
 from eqrt.runtime.bench.report import SCHEMA, Case, Punctuality, Report, Settings, WorkloadResult
 from eqrt.runtime.bench.resources import Resources
@@ -119,3 +127,45 @@ def report(*cases: Case, **settings: object) -> Report:
         ),
         cases=cases,
     )
+
+
+SERVICE_REPORT = report(
+    replace(case(32), workloads=(result((4 * MS,) * 700, "service"),)),
+    benchmark="service",
+    schedule="periodic",
+    rate_hz=10.0,
+    bus="eqrt_local",
+)
+
+
+def bench(*arguments: str) -> int:
+    parser = cli.Parser(prog="eqrt bench", allow_abbrev=False)
+    command.add_arguments(parser)
+    return command.run(parser.parse_args(arguments))
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run left."""
+
+    status: int
+    said: str
+    report: Report
+    page: str
+
+
+def bench_for_real(folder: Path, said: pytest.CaptureFixture[str], *options: str) -> Run:
+    written = folder / "report.json", folder / "report.html"
+    status = bench("--json", str(written[0]), "--html", str(written[1]), *options)
+    return Run(
+        status, said.readouterr().out, read_json(Report, written[0], SCHEMA), written[1].read_text()
+    )
+
+
+def documented_keys(values: Any) -> set[str]:
+    """All keys in it, at any depth."""
+    if isinstance(values, list):
+        return set().union(*map(documented_keys, values))
+    if isinstance(values, dict):
+        return set(values).union(*map(documented_keys, values.values()))
+    return set()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from eqrt.core.contract import METADATA_KEY, ModelContract
+from eqrt.runtime.prediction.graph_writer import Node, tensor, write_model
+from eqrt.runtime.prediction.protobuf import nested, number, text
 from eqrt.runtime.verify.scenes import hostile_scenes, moved, random_pose
 
 CONTRACT = ModelContract(
@@ -32,10 +33,6 @@ CONTRACT = ModelContract(
 )
 MADE_VECTORS = 22
 """Test vectors of the artifact."""
-_KINDS = {"float32": 1, "int64": 7, "bool": 9}
-
-Node = tuple[str, Sequence[str], str, Mapping[str, int]]
-"""Operator, inputs, output, whole-number attributes."""
 
 FLAWS: dict[str, list[Node]] = {
     "wind": [("Add", ["steady", "ahead"], "flawed", {})],
@@ -105,7 +102,7 @@ def write_handmade(
     sure: what every probability is. batch: the only number of targets, if not any.
     """
     folder.mkdir(parents=True)
-    text = contract.to_json()
+    told = contract.to_json()
     model = _model(
         contract,
         flaw=FLAWS.get(flaw or "", []),
@@ -114,9 +111,9 @@ def write_handmade(
         opset=opset,
         ir_version=ir_version,
     )
-    model += _nested(14, _text(1, METADATA_KEY) + _text(2, text))
+    model += nested(14, text(1, METADATA_KEY) + text(2, told))
     (folder / "model.onnx").write_bytes(model)
-    (folder / "contract.json").write_text(text, encoding="utf-8")
+    (folder / "contract.json").write_text(told, encoding="utf-8")
     _write_vectors(folder, contract, model)
     sign(folder)
     return folder
@@ -133,22 +130,15 @@ def sign(folder: Path) -> None:
     sums.write_text("".join(lines), encoding="utf-8")
 
 
-def tensor(name: str, values: NDArray[Any]) -> bytes:
-    """A TensorProto."""
-    dims = b"".join(_number(1, size) for size in values.shape)
-    kind = _number(2, _KINDS[values.dtype.name])
-    return dims + kind + _text(8, name) + _nested(9, values.tobytes())
-
-
 def external_tensor(name: str, location: str) -> bytes:
     """A TensorProto of one float32 that lies in another file."""
-    entry = _nested(13, _text(1, "location") + _text(2, location))
-    return _number(1, 1) + _number(2, 1) + _text(8, name) + entry + _number(14, 1)
+    entry = nested(13, text(1, "location") + text(2, location))
+    return number(1, 1) + number(2, 1) + text(8, name) + entry + number(14, 1)
 
 
 def with_initializer(model: bytes, initializer: bytes) -> bytes:
     """A ModelProto with one more tensor: repeated messages are joined by appending them."""
-    return model + _nested(7, _nested(5, initializer))
+    return model + nested(7, nested(5, initializer))
 
 
 def _write_vectors(folder: Path, contract: ModelContract, model: bytes) -> None:
@@ -219,49 +209,11 @@ def _model(
             ("Mul", ["places", "nothing"], "nowhere", {}),
             ("Add", ["nowhere", "circle"], "covariances", {}),
         ]
-    graph = b"".join(_nested(1, _node(*node)) for node in nodes) + _text(2, "handmade")
-    graph += b"".join(_nested(5, tensor(name, values)) for name, values in constants.items())
-    for field, specs in ((11, contract.inputs), (12, contract.outputs)):
-        for name, (kind, shape) in specs.items():
-            graph += _nested(field, _value_info(name, kind, (batch or "B", *shape[1:])))
-    return _number(1, ir_version) + _nested(7, graph) + _nested(8, _number(2, opset))
-
-
-def _node(
-    operator: str, inputs: Sequence[str], output: str, attributes: Mapping[str, int]
-) -> bytes:
-    parts = [_text(1, name) for name in inputs] + [_text(2, output), _text(4, operator)]
-    for name, value in attributes.items():
-        parts.append(_nested(5, _text(1, name) + _number(3, value) + _number(20, 2)))
-    return b"".join(parts)
-
-
-def _value_info(name: str, kind: str, shape: Sequence[int | str]) -> bytes:
-    dims = b"".join(
-        _nested(1, _number(1, size) if isinstance(size, int) else _text(2, size)) for size in shape
+    inputs, outputs = (
+        {name: (kind, (batch or "B", *shape[1:])) for name, (kind, shape) in specs.items()}
+        for specs in (contract.inputs, contract.outputs)
     )
-    of_type = _nested(1, _number(1, _KINDS[kind]) + _nested(2, dims))
-    return _text(1, name) + _nested(2, of_type)
-
-
-def _number(field: int, value: int) -> bytes:
-    return _varint(field << 3) + _varint(value)
-
-
-def _text(field: int, text: str) -> bytes:
-    return _nested(field, text.encode())
-
-
-def _nested(field: int, content: bytes) -> bytes:
-    return _varint(field << 3 | 2) + _varint(len(content)) + content
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*out, value])
+    return write_model(nodes, constants, inputs, outputs, opset=opset, ir_version=ir_version)
 
 
 def contract_with(contract: ModelContract, **changes: object) -> str:

@@ -46,7 +46,7 @@ COMMANDS = {
     ),
     "bench": (
         "eqrt.runtime.bench.command",
-        "measure the model on this machine: latency, memory, verdict",
+        "measure model or service on this machine: latency, memory, verdict",
     ),
     "encode": ("eqrt.export.encode", "turn a recorded scenario into a CAN log and its tile"),
 }

@@ -12,7 +12,6 @@ import re
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from importlib.metadata import version
@@ -24,25 +23,35 @@ from numpy.typing import NDArray
 
 from can_recordings import detections_of, feed_all, messages_of
 from drives import DEMO, DRIVES, TILE, shipped_predictor
+from eqrt.runtime.bench.environment import Environment, read_environment
+from eqrt.runtime.bench.report import PERIODIC, SERVICE, Settings
+from eqrt.runtime.bench.service.case import Setup, measure_service
+from eqrt.runtime.bench.service.crowd import PROFILE, crowded_cycles
+from eqrt.runtime.bench.service.orders import BusOrder
+from eqrt.runtime.bench.table import ms
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.decoding.can_io import Decoder
-from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
-from eqrt.runtime.decoding.generic_objects import MAX_OBJECT_ID, encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.demo.score import Scoreboard
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.replay import replay
-from processes import PATIENCE_S, Heard, Serving, playing
+from processes import PATIENCE_S, Serving, playing
 from rav4_drive import read_drive
 
-OBJECTS, SECONDS, STARTS = 32, 30.0, 9
-ASIDE_M = 4.0  # between a recorded car and its copy
-MESSAGE_S = 0.00025  # a classic message of eight bytes on a bus of 500 kbit/s
-LAST_INPUT_ID = 0x5A5  # OBJECT_MOTION ends a cycle of the generic object list
-STATUS_IDS, DETAIL_IDS = (0x6E0, 0x6E2), (0x6E1, 0x6E5)
+OBJECTS, SECONDS, LOG_S, STARTS = 32, 70.0, 30.0, 9
+TRAJECTORY_ID = 0x6E1  # of CAN FD
+SETTINGS = Settings(
+    benchmark=SERVICE,
+    targets=(OBJECTS,),
+    seconds=SECONDS,
+    schedule=PERIODIC,
+    rate_hz=10.0,
+    threads=1,
+)
 CHANNELS = (f"figures-{os.getpid()}-{number}" for number in itertools.count())
 
 Float64 = NDArray[np.float64]
@@ -58,8 +67,7 @@ def main() -> int:
             ("decoding", decode_counts()),
             ("ego motion", ego_drift()),
             ("replay, not in real time", replays()),
-            ("the pipeline by stage", stages(log)),
-            ("service", service(log)),
+            ("service", service()),
             ("start", starts(log)),
         ):
             print(f"\n{title}")
@@ -143,74 +151,48 @@ def scores(forecasts: Iterable[ForecastSet]) -> str:
     return f"{board.count:7,} {ade:>31} {fde:>15}"
 
 
-def stages(log: Path) -> Iterator[str]:
-    """Medians over the busy drive, in this process."""
-    pipeline = Pipeline(
-        load_profile("generic"), shipped_predictor(), load_tile(TILE), clock=time.perf_counter
-    )
-    spent: dict[str, list[float]] = defaultdict(list)
-    for message in read_log(log):
-        for forecast in pipeline.feed(message, message.timestamp):
-            spent["all"].append(forecast.compute_s)
-            spent["tracks"].append(pipeline.times.tracks_s)
-            spent["scene"].append(pipeline.times.scene_s)
-            spent["inference"].append(pipeline.times.infer_s)
-            spent["guard"].append(pipeline.times.guard_s)
-    yield f"{OBJECTS} objects, ms: " + ", ".join(
-        f"{name} {1e3 * np.median(values):.2f}" for name, values in spent.items()
-    )
-
-
 # --- the service, in a process of its own
 
 
-def service(log: Path) -> Iterator[str]:
-    """32 objects at 10 Hz, played by one process, served by a second, heard by this one."""
-    for name, options in (("CAN FD", ["--fd"]), ("classic CAN", ["--no-fd"])):
-        channel = next(CHANNELS)
-        bus = ["--can", channel, "--can-interface", LOCAL]
-        with (
-            Heard(channel) as heard,
-            Serving(*bus, *options, "--profile", "generic", "--tile", str(TILE)) as serving,
-        ):
-            with playing(log, "--can", channel) as player:
-                player.wait()
-            memory = memory_mib(serving.pid)
-            serving.end()
-        latency_ms = 1e3 * np.array(latencies_s(heard.messages))
-        p50, p99 = np.quantile(latency_ms, [0.5, 0.99])
+def service() -> Iterator[str]:
+    """32 objects at 10 Hz, sent by one process and answered by another: `eqrt bench --service`."""
+    environment = read_environment()
+    for name, fd in (("CAN FD", True), ("classic CAN", False)):
+        bus = BusOrder(channel=next(CHANNELS), interface=LOCAL, fd=fd)
+        case = measure_service(setup_on(bus, environment), OBJECTS, SETTINGS, environment, never)
+        assert case is not None
+        total, memory = case.judged.total.percentiles, case.resources
         yield (
             f"{name:12} last message of a cycle to the last of its predictions on the bus: "
-            f"p50 {p50:.1f} ms, p99 {p99:.1f} ms ({len(latency_ms)} cycles of {OBJECTS} objects)"
+            f"p50 {ms(total['p50'].value_ns)} ms, p99 {ms(total['p99'].value_ns)} ms "
+            f"({case.judged.samples} cycles of {OBJECTS} objects)"
+        )
+        yield f"{name:12} of which, medians, ms: " + ", ".join(
+            f"{stage} {ms(found.percentiles['p50'].value_ns)}"
+            for stage, found in case.judged.stages.items()
         )
         yield (
             f"{name:12} memory of the process after {SECONDS:.0f} s: "
-            f"{memory['VmRSS']:.1f} MiB, at most {memory['VmHWM']:.1f} MiB"
+            f"{memory.rss_end_mib:.1f} MiB, at most {memory.rss_peak_mib:.1f} MiB"
         )
 
 
-def latencies_s(messages: list[can.Message]) -> list[float]:
-    """By the kernel's stamps at the listener; cycles of fewer objects are left out."""
-    found: list[float] = []
-    asked_s = said_s = 0.0
-    objects = 0
-    for message in sorted(messages, key=lambda one: one.timestamp):
-        if message.arbitration_id in STATUS_IDS:
-            objects = message.data[5 if message.arbitration_id == STATUS_IDS[0] else 3]
-            started_s = asked_s
-        elif message.arbitration_id in DETAIL_IDS:
-            said_s = message.timestamp
-        elif message.arbitration_id == LAST_INPUT_ID:
-            if objects >= OBJECTS:  # more: some were there a moment ago
-                found.append(said_s - started_s)
-            objects, asked_s = 0, message.timestamp
-    return found
+def never() -> bool:
+    """Measure to the end."""
+    return False
 
 
-def memory_mib(pid: int) -> dict[str, float]:
-    """VmRSS and VmHWM of a process; the kernel's kB are of 1,024 bytes."""
-    text = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
-    return {key: int(kb) / 1024 for key, kb in re.findall(r"(Vm(?:RSS|HWM)):\s+(\d+) kB", text)}
+def setup_on(bus: BusOrder, environment: Environment) -> Setup:
+    """The service on this bus, and its traffic."""
+    return Setup(
+        bus=bus,
+        profile=PROFILE,
+        model=DEFAULT_ARTIFACT,
+        tile=TILE,
+        stationary=False,
+        log=None,
+        traffic_cores=environment.cores_allowed,
+    )
 
 
 def starts(log: Path) -> Iterator[str]:
@@ -237,81 +219,18 @@ def wait_for_prediction(ear: can.BusABC) -> None:
     give_up_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < give_up_s:
         message = ear.recv(1.0)
-        if message is not None and message.arbitration_id == DETAIL_IDS[0]:
+        if message is not None and message.arbitration_id == TRAJECTORY_ID:
             return
     raise TimeoutError("no prediction came")
 
 
-# --- the drive that keeps it busy
-
-
 def busy_messages() -> Iterator[can.Message]:
-    """Half a minute of the demo's NGSIM drive with 32 cars in every cycle: those that were
-    recorded, nearest first, and copies of them some metres aside.
-    """
-    decoder, ids = Decoder(load_profile("generic")), Ids()
-    motion, pose, end_s, counter = None, None, None, 0
-    for message in read_log(DRIVES["ngsim"].log):
-        end_s = end_s or message.timestamp + SECONDS
-        if message.timestamp >= end_s:
-            return
-        for event in decoder.feed(message, message.timestamp):
-            if isinstance(event, EgoMotion):
-                motion = event
-            elif isinstance(event, EgoPose):
-                pose = event
-            elif motion and pose and len(event.object_id):
-                counter += 1
-                yield from encode_cycle(
-                    crowded(event, ids),
-                    timestamp_s=event.timestamp_s,
-                    counter=counter,
-                    speed_mps=motion.speed_mps,
-                    yaw_rate_rad_s=motion.yaw_rate_rad_s,
-                    map_from_ego=pose.map_from_ego,
-                    message_s=MESSAGE_S,
-                    channel="can0",
-                )
-
-
-class Ids:
-    """Numbers for (object id, copy), kept as long as both are there."""
-
-    def __init__(self) -> None:
-        self._numbers: dict[tuple[int, int], int] = {}
-
-    def assign(self, keys: list[tuple[int, int]]) -> tuple[list[int], list[bool]]:
-        """The numbers, and whether each is new."""
-        before = self._numbers
-        self._numbers = {key: before[key] for key in keys if key in before}
-        used = set(before.values())
-        free = (number for number in range(MAX_OBJECT_ID + 1) if number not in used)
-        for key in keys:
-            if key not in self._numbers:
-                self._numbers[key] = next(free)
-        return [self._numbers[key] for key in keys], [key not in before for key in keys]
-
-
-def crowded(seen: Detections, ids: Ids) -> Detections:
-    """Exactly 32 objects."""
-    near = np.argsort(np.linalg.norm(seen.position, axis=1), kind="stable")
-    rows = np.resize(near, OBJECTS)
-    copy = np.arange(OBJECTS) // len(near)
-    keys = list(zip(seen.object_id[rows].tolist(), copy.tolist(), strict=True))
-    numbers, is_new = ids.assign(keys)
-    aside = np.stack([np.zeros(OBJECTS), ASIDE_M * copy], axis=-1)
-    return replace(
-        seen,
-        object_id=np.array(numbers),
-        is_new=np.array(is_new),
-        position=seen.position[rows] + aside,
-        velocity=seen.velocity[rows],
-        heading_rad=seen.heading_rad[rows],
-        length_m=seen.length_m[rows],
-        width_m=seen.width_m[rows],
-        object_class=seen.object_class[rows],
-        existence=seen.existence[rows],
-    )
+    """Half a minute of traffic that never has fewer objects."""
+    for number, cycle in enumerate(itertools.islice(crowded_cycles(OBJECTS), round(10 * LOG_S))):
+        for message in cycle:
+            message.timestamp += number / 10
+            message.channel = "can0"
+            yield message
 
 
 def write_log(path: Path, messages: Iterable[can.Message]) -> None:

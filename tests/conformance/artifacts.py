@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eqrt.runtime.prediction.graph_writer import tensor
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
-from handmade_model import CONTRACT, sign, tensor, write_handmade
+from handmade_model import CONTRACT, sign, write_handmade
 from python_example import read_tensor
 from source_tree import ROOT
 

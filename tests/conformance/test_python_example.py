@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from eqrt.runtime.prediction.graph_writer import tensor
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.runtime.prediction.tensor_proto import read_tensor as eqrts_own
-from handmade_model import CONTRACT, tensor, write_handmade
+from handmade_model import CONTRACT, write_handmade
 from python_example import compare, main, pack, read_tensor
 from source_tree import ROOT
 

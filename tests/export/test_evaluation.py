@@ -210,6 +210,14 @@ def test_constant_velocity_on_a_target_that_speeds_up(
     np.testing.assert_allclose(list(found.values()), list(expected.values()), atol=1e-4)
 
 
+def test_the_kalman_filter_on_the_same_targets_ends_as_far_off_give_or_take_its_settling(
+    packed: Path, tmp_path: Path
+) -> None:
+    found = errors(evaluate(tmp_path, "--data", packed), "Kalman filter")
+    assert found["fde_3s"] == pytest.approx(6.0 / 2, abs=0.05)
+    assert found["ade_1s"] == pytest.approx(0.2 * 5.5 / 2, abs=0.05)
+
+
 def test_what_is_not_wholly_seen_is_left_out_and_counted(packed: Path, tmp_path: Path) -> None:
     report = evaluate(tmp_path, "--data", packed)
     assert (report["targets"], report["left_out"]) == (2, 1)

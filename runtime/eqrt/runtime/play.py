@@ -117,7 +117,7 @@ class Player:
                 self.not_sent += 1
                 continue
             self.latest_s = max(self.latest_s, time.monotonic() - due_s)
-            _send(bus, message, should_stop)
+            send(bus, message, should_stop)
             self.sent += 1
 
     def summary(self) -> str:
@@ -167,7 +167,8 @@ class _Pace:
         return self._due_s
 
 
-def _send(bus: can.BusABC, message: can.Message, should_stop: Callable[[], bool]) -> None:
+def send(bus: can.BusABC, message: can.Message, should_stop: Callable[[], bool]) -> None:
+    """Send one message, however long the bus is full. Raises BusError if it stays so."""
     give_up_s = time.monotonic() + _RETRY_S
     while True:
         try:

@@ -27,6 +27,13 @@ class Receiver(Protocol):
         """The next message, or None after `timeout` seconds."""
 
 
+class Clock(Protocol):
+    """The pipeline's time while serving."""
+
+    def now_s(self, monotonic_s: float, stamp_s: float | None, wall_s: float) -> float:
+        """When the message stamped `stamp_s` arrived; None = no message came, and it is now."""
+
+
 class Publisher(Protocol):
     """Where predictions go."""
 
@@ -64,12 +71,14 @@ class Service:
         receiver: Receiver,
         publishers: list[Publisher],
         report: Callable[[str], None],
+        clock: Clock | None = None,
     ) -> None:
+        """`clock`: None = when messages arrive."""
         self._pipeline = pipeline
         self._receiver = receiver
         self._publishers = publishers
         self._report = report
-        self._clock = ArrivalClock()
+        self._clock = clock or ArrivalClock()
         self._second = Report()
 
     def run(self, should_stop: Callable[[], bool]) -> None:

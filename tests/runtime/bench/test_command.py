@@ -5,54 +5,26 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench_reports import case, report
-from eqrt import cli
+from bench_reports import bench, bench_for_real, case, report
 from eqrt.core.errors import EqrtError, UsageError
-from eqrt.runtime.bench import command
 from eqrt.runtime.bench.environment import (
     allow_cores,
     allowed_cores,
     parse_cores,
     parse_cpuinfo,
 )
-from eqrt.runtime.bench.json_form import read_json, to_json
-from eqrt.runtime.bench.predictors import load_timed, workloads
-from eqrt.runtime.bench.report import SCHEMA, Report
+from eqrt.runtime.bench.json_form import to_json
+from eqrt.runtime.bench.predictors import ModelWorkload, load_timed
 from eqrt.runtime.bench.scenes import shuffled
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 
 ARM = "processor : 0\nModel : Board 5\nFeatures : fp asimd asimddp crc32\n"
 INTEL = "model name : Xeon\nflags : fpu sse2 avx2 fma avx512f avx512_vnni amx_int8 hypervisor\n"
-
-
-def bench(*arguments: str) -> int:
-    parser = cli.Parser(prog="eqrt bench", allow_abbrev=False)
-    command.add_arguments(parser)
-    return command.run(parser.parse_args(arguments))
-
-
-@dataclass(frozen=True)
-class Run:
-    """What one run left."""
-
-    status: int
-    said: str
-    report: Report
-    page: str
-
-
-def bench_for_real(folder: Path, said: pytest.CaptureFixture[str], *options: str) -> Run:
-    written = folder / "report.json", folder / "report.html"
-    status = bench("--json", str(written[0]), "--html", str(written[1]), *options)
-    return Run(
-        status, said.readouterr().out, read_json(Report, written[0], SCHEMA), written[1].read_text()
-    )
 
 
 def test_back_to_back_with_a_budget_and_a_baseline_that_nothing_can_keep(
@@ -69,14 +41,15 @@ def test_back_to_back_with_a_budget_and_a_baseline_that_nothing_can_keep(
     assert "ANOTHER MODEL: handmade" in run.said
     assert "REGRESSION" in run.page
     measured = run.report.cases[0]
-    model, velocity, turn = measured.workloads
+    model, velocity, turn, filtered = measured.workloads
     assert [load.name for load in measured.workloads] == [
         "model",
         "constant velocity",
-        "constant turn",
+        "constant turn rate",
+        "Kalman filter",
     ]
     assert list(model.stages) == ["gather", "infer", "map frame"]
-    assert model.samples == velocity.samples == turn.samples
+    assert model.samples == velocity.samples == turn.samples == filtered.samples
     assert sum(model.histogram.counts) == model.samples
     means = [stage.mean_ns for stage in model.stages.values()]
     assert model.total.mean_ns == pytest.approx(sum(means), abs=2)
@@ -135,7 +108,7 @@ def arrays_of(count: int) -> dict[str, np.typing.NDArray[np.generic]]:
 
 def test_stages_add_up_also_when_a_prediction_needs_several_runs_of_the_graph() -> None:
     predictor = load_timed(DEFAULT_ARTIFACT, 1)
-    model = workloads(predictor, shuffled(arrays_of(40)), 40)[0]
+    model = ModelWorkload(predictor, shuffled(arrays_of(40)), 40)
     durations: Sequence[int] = model.run(0)
     assert len(durations) == len(model.stages)
     assert all(duration > 0 for duration in durations)

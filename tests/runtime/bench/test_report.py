@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench_reports import MS, case, report
+from bench_reports import MS, case, documented_keys, report
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.bench.baseline import compare
 from eqrt.runtime.bench.charts import log_ticks, round_ticks
@@ -58,14 +58,6 @@ def test_keys_stand_in_the_documented_order() -> None:
         "cold_start",
         "cases",
     ]
-
-
-def documented_keys(values: Any) -> set[str]:
-    if isinstance(values, list):
-        return set().union(*map(documented_keys, values))
-    if isinstance(values, dict):
-        return set(values).union(*map(documented_keys, values.values()))
-    return set()
 
 
 def test_every_key_is_documented() -> None:

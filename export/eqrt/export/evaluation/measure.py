@@ -93,7 +93,7 @@ def measure_piece(piece: Piece) -> Measured:
 
 
 def measure(model: Model, selection: Selection, piece: Piece) -> Measured:
-    """The errors of a model and of both baselines on the windows of a selection.
+    """The errors of a model and of the baselines on the windows of a selection.
 
     Raises EqrtError if none of them is complete, or the model predicts what is not a number.
     """

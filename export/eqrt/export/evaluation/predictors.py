@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
+from eqrt.core.kalman import kalman
 from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
 from eqrt.core.scene import Scene
 from eqrt.runtime.prediction.predictor import Predictor
@@ -125,7 +126,7 @@ def _from_checkpoint(path: Path, checkpoint: Checkpoint) -> Model:
 
 
 def baselines(dt_s: float, horizon_steps: int) -> Mapping[str, Forecast]:
-    """Constant velocity, and constant turn rate and velocity, of the target's own history."""
+    """Physics, of the target's own history: constant velocity, constant turn, a Kalman filter."""
 
     def velocity(windows: Windows) -> Predicted:
         history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
@@ -136,7 +137,11 @@ def baselines(dt_s: float, horizon_steps: int) -> Mapping[str, Forecast]:
         motion = fit_motion(history, valid, dt_s)
         return _one_mode(constant_turn(history[:, -1], *motion, horizon_steps, dt_s))
 
-    return {"constant velocity": velocity, "constant turn rate": turn}
+    def filtered(windows: Windows) -> Predicted:
+        history, valid = windows.history[:, 0].astype(np.float64), windows.history_valid[:, 0]
+        return _one_mode(kalman(history, valid, horizon_steps, dt_s))
+
+    return {"constant velocity": velocity, "constant turn rate": turn, "Kalman filter": filtered}
 
 
 def _one_mode(course: Float64) -> Predicted:

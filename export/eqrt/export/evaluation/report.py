@@ -23,6 +23,7 @@ SCHEMA = 1
 WIDTH = 100
 """Columns of the table, where paths are not longer."""
 BASELINES = ("constant velocity", "constant turn rate")
+"""Those that stand beside the model in every row; the table of all targets has the others too."""
 SHORT = {"constant velocity": "const. vel.", "constant turn rate": "const. turn"}
 _NAME = 19  # columns of a row's name
 _INDENT = 12  # columns of what stands above the table

@@ -9,7 +9,7 @@ from pathlib import Path
 from eqrt.core.errors import UsageError
 from eqrt.runtime.bench.json_form import read_json
 from eqrt.runtime.bench.percentiles import Estimate
-from eqrt.runtime.bench.report import SCHEMA, Case, Report, Settings, counted
+from eqrt.runtime.bench.report import NOUNS, SCHEMA, Case, Report, Settings
 
 MARGIN = 0.05
 """Less than this is not called a regression, however sure."""
@@ -19,7 +19,8 @@ MARGIN = 0.05
 class Change:
     """One percentile of the judged workload, before and now."""
 
-    targets: int
+    title: str
+    """Of the case."""
     percentile: str
     before: Estimate
     now: Estimate
@@ -67,7 +68,8 @@ def load_baseline(path: Path, settings: Settings) -> Report:
         )
     if not {case.targets for case in baseline.cases} & set(settings.targets):
         measured = ",".join(str(case.targets) for case in baseline.cases)
-        raise UsageError(f"{path} measured {measured or 'no'} targets; give one of them: --targets")
+        noun = NOUNS[settings.benchmark]
+        raise UsageError(f"{path} measured {measured or 'no'} {noun}s; give one of them: --{noun}s")
     return baseline
 
 
@@ -83,7 +85,7 @@ def _changes(before: Case, now: Case) -> Iterator[Change]:
     old = before.judged.total.percentiles
     for name, estimate in now.judged.total.percentiles.items():
         if name in old:
-            yield Change(targets=now.targets, percentile=name, before=old[name], now=estimate)
+            yield Change(title=now.title, percentile=name, before=old[name], now=estimate)
 
 
 def _remarks(baseline: Report, report: Report, pairs: list[tuple[Case, Case]]) -> Iterator[str]:
@@ -116,7 +118,7 @@ def _control(before: Case, now: Case) -> Iterator[str]:
         ratio = estimates[1].value_ns / max(estimates[0].value_ns, 1)
         if not 1.0 - MARGIN <= ratio <= 1.0 + MARGIN:
             yield (
-                f"{counted(now.targets)}: {workload.name} took {ratio:.2f} x as long, too: "
+                f"{now.title}: {workload.name} took {ratio:.2f} x as long, too: "
                 "that much is the machine"
             )
             return

@@ -11,7 +11,17 @@ from typing import Any
 
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bench.percentiles import PERCENTILES
-from eqrt.runtime.bench.report import BACK_TO_BACK, SCHEDULES, Case, Report, Settings, counted
+from eqrt.runtime.bench.report import (
+    BACK_TO_BACK,
+    MODEL,
+    NOUNS,
+    SCHEDULES,
+    SERVICE,
+    Case,
+    Report,
+    Settings,
+    counted,
+)
 
 
 def _percentile_ms(name: str, case: Case) -> float | None:
@@ -33,7 +43,7 @@ CASE_LIMITS: Mapping[str, Callable[[Case], float | None]] = {
     "deadline_misses": lambda case: case.punctuality.misses if case.punctuality else None,
 }
 """Key of a table [targets.N] -> what it limits; None = was not measured."""
-_KEYS = ("schedule", "rate_hz", "threads", "start", "targets")
+_KEYS = ("schedule", "rate_hz", "threads", "start", "targets", SERVICE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,12 +54,17 @@ class Budget:
     schedule: str
     rate_hz: float | None
     threads: int
+    benchmark: str
+    """What `start` and `targets` are limits of: `model` or `service`."""
     start: dict[str, float]
     targets: dict[int, dict[str, float]]
 
 
-def load_budget(path: Path) -> Budget:
-    """Read a budget. Raises EqrtError if it cannot be read or has a key that nothing stands for."""
+def load_budget(path: Path, benchmark: str = MODEL) -> Budget:
+    """Read the part of a budget that is for the model, or for the service.
+
+    Raises EqrtError if it cannot be read or has a key that nothing stands for.
+    """
     try:
         with path.open("rb") as stream:
             values = tomllib.load(stream)
@@ -58,18 +73,39 @@ def load_budget(path: Path) -> Budget:
     except ValueError as error:  # not TOML, or not UTF-8
         raise EqrtError(f"{path}: not TOML ({error})") from error
     _known(path, "", values, _KEYS)
-    targets = _table(path, "targets", values.get("targets", {}))
+    parts: dict[str, Mapping[str, Any]] = {
+        MODEL: {key: values[key] for key in ("start", "targets") if key in values},
+        SERVICE: _table(path, SERVICE, values.get(SERVICE, {})),
+    }
+    _known(path, f"{SERVICE}.", parts[SERVICE], ("start", "objects"))
+    prefix = {MODEL: "", SERVICE: f"{SERVICE}."}
+    limits = {
+        name: _part(path, prefix[name], f"{NOUNS[name]}s", part) for name, part in parts.items()
+    }
+    start, cases = limits[benchmark]
     return Budget(
         path=path,
         schedule=_schedule(path, values),
         rate_hz=_rate(path, values),
         threads=int(_number(path, "threads", values.get("threads", 1))),
-        start=_limits(path, "start", values.get("start", {}), START_LIMITS),
-        targets={
-            _count(path, key): _limits(path, f"targets.{key}", table, CASE_LIMITS)
-            for key, table in targets.items()
-        },
+        benchmark=benchmark,
+        start=start,
+        targets=cases,
     )
+
+
+def _part(
+    path: Path, prefix: str, counts: str, values: Mapping[str, Any]
+) -> tuple[dict[str, float], dict[int, dict[str, float]]]:
+    """The limits of the start, and of each number of targets or objects."""
+    cases = _table(path, f"{prefix}{counts}", values.get(counts, {}))
+    start = _limits(path, f"{prefix}start", values.get("start", {}), START_LIMITS)
+    return start, {
+        _count(path, f"{prefix}{counts}", key): _limits(
+            path, f"{prefix}{counts}.{key}", table, CASE_LIMITS
+        )
+        for key, table in cases.items()
+    }
 
 
 def check_duty(budget: Budget, settings: Settings) -> None:
@@ -81,11 +117,14 @@ def check_duty(budget: Budget, settings: Settings) -> None:
             f"{budget.path} is for --schedule {budget.schedule}{rate} --threads {budget.threads}; "
             "measure that, or give another budget"
         )
+    noun = NOUNS[budget.benchmark]
+    if not budget.start and not budget.targets:
+        raise UsageError(f"{budget.path} has no limits for the {budget.benchmark}; give another")
     missing = sorted(set(budget.targets) - set(settings.targets))
     if missing:
         raise UsageError(
-            f"{budget.path} has limits for {','.join(map(str, missing))} targets, which are not "
-            "measured; add them to --targets"
+            f"{budget.path} has limits for {','.join(map(str, missing))} {noun}s, which are not "
+            f"measured; add them to --{noun}s"
         )
 
 
@@ -106,7 +145,7 @@ def _broken_start(budget: Budget, report: Report) -> Iterator[str]:
 def _broken_cases(budget: Budget, report: Report) -> Iterator[str]:
     cases = {case.targets: case for case in report.cases}
     for targets, limits in budget.targets.items():
-        what = counted(targets)
+        what = counted(targets, budget.benchmark)
         for key, allowed in limits.items():
             found = CASE_LIMITS[key](cases[targets]) if targets in cases else None
             if found is None:
@@ -143,9 +182,10 @@ def _rate(path: Path, values: Mapping[str, Any]) -> float | None:
     return _number(path, "rate_hz", values.get("rate_hz"))
 
 
-def _count(path: Path, key: str) -> int:
+def _count(path: Path, where: str, key: str) -> int:
     if not key.isdecimal() or int(key) < 1:
-        raise EqrtError(f"{path}: [targets.{key}]: {key!r} is no number of targets")
+        noun = where.rpartition(".")[2]
+        raise EqrtError(f"{path}: [{where}.{key}]: {key!r} is no number of {noun}")
     return int(key)
 
 

@@ -49,7 +49,7 @@ def histogram_chart(histogram: Histogram, marks: dict[str, int]) -> str:
     """
     edges = [edge / 1e6 for edge in histogram.edges_ns]
     x = _axis_x(edges[0], edges[-1])
-    y = Axis(0.5, max(1.0, *histogram.counts), HEIGHT - _BOTTOM, _TOP, log=True)
+    y = Axis(0.7, max(2.0, *histogram.counts), HEIGHT - _BOTTOM, _TOP, log=True)
     parts = [*_grid(x, y, "ms", "samples")]
     for left, right, count in zip(edges, edges[1:], histogram.counts, strict=False):
         if count:
@@ -90,13 +90,16 @@ def stages_chart(workload: WorkloadResult) -> str:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten between two numbers above 0, with 2 and 5 times them where there is room."""
+    """Powers of ten between two numbers above 0, with 2 and 5 times them where there is room.
+
+    Where there are fewer than two of these, round values at equal distances.
+    """
     powers = range(floor(log10(low)), ceil(log10(high)) + 1)
     for factors in ((1, 2, 5), (1,)):
         ticks = [factor * 10.0**power for power in powers for factor in factors]
         inside = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
         if len(inside) <= 6:
-            return inside if len(inside) > 1 else [low, high]
+            return inside if len(inside) > 1 else round_ticks(low, high)
     return inside[:: ceil(len(inside) / 6)]
 
 
@@ -124,9 +127,11 @@ def _grid(x: Axis, y: Axis, x_unit: str, y_unit: str) -> Iterator[str]:
     for tick in y.ticks():
         at = y.at(tick)
         yield f'<line class="grid" x1="{_LEFT}" x2="{WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
-        yield _text(_LEFT - 5, at + 4, _shown(tick), "end")
+        yield _text(_LEFT - 5, at + 4, shown(tick), "end")
     for tick in x.ticks():
-        yield _text(x.at(tick), HEIGHT - _BOTTOM + 14, _shown(tick), "middle")
+        at = x.at(tick)
+        anchor = "middle" if at < WIDTH - _RIGHT - 12 else "end"  # else it would be cut off
+        yield _text(at, HEIGHT - _BOTTOM + 14, shown(tick), anchor)
     yield _text(WIDTH - _RIGHT, HEIGHT - 3, x_unit, "end", "unit")
     yield _text(4, 11, y_unit, "start", "unit")
 
@@ -160,7 +165,8 @@ def _text(x: float, y: float, text: str, anchor: str, style: str = "label") -> s
     return f'<text class="{style}" {place}>{escape(text)}</text>'
 
 
-def _shown(value: float) -> str:
+def shown(value: float) -> str:
+    """A tick's label."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
 
 

@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,14 @@ class ColdStart:
 
 def measure_cold_start(artifact: Path, threads: int) -> ColdStart:
     """Start STARTS processes, one after the other. Raises EqrtError if one fails."""
-    answers = [_start(artifact, threads) for _ in range(STARTS)]
+    return medians([_start(artifact, threads) for _ in range(STARTS)])
+
+
+def medians(answers: Sequence[Mapping[str, float]]) -> ColdStart:
+    """Of what several starts said: total_ns, import_ns, load_ns, first_ns, bare_mib, rss_mib."""
     middle = {key: float(np.median([answer[key] for answer in answers])) for key in answers[0]}
     return ColdStart(
-        starts=STARTS,
+        starts=len(answers),
         total_s=round(middle["total_ns"] / 1e9, 4),
         slowest_s=round(max(answer["total_ns"] for answer in answers) / 1e9, 4),
         import_s=round(middle["import_ns"] / 1e9, 4),

@@ -1,5 +1,7 @@
 """Frozen dataclasses to JSON and back, with every value's type checked on the way in.
 
+A field that has a default may be missing: it came later than the file.
+
 Keys stand in the order of the fields, so that equal values give equal bytes.
 """
 
@@ -8,7 +10,7 @@ from __future__ import annotations
 import json
 import types
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -70,10 +72,10 @@ def _parse(kind: Any, value: Any, where: str) -> Any:
 
 def _parse_fields(kind: Any, values: dict[str, Any], where: str) -> Any:
     hints = get_type_hints(kind)
-    names = [field.name for field in fields(kind)]
-    for name in names:
-        if name not in values:
-            raise ValueError(f"{f'{where}.{name}'.lstrip('.')} is missing")
+    for field in fields(kind):
+        if field.name not in values and field.default is MISSING:
+            raise ValueError(f"{f'{where}.{field.name}'.lstrip('.')} is missing")
+    names = [field.name for field in fields(kind) if field.name in values]
     return kind(**{name: _parse(hints[name], values[name], f"{where}.{name}") for name in names})
 
 

@@ -1,13 +1,14 @@
 """Runs workloads by a schedule and keeps every sample, then sums them up.
 
-In every turn all workloads run, always in the same order: the one that is judged comes first, right
-after the wake-up, as it would in the car; the others meet the same scenes at the same time.
+In every turn all workloads run. The one that is judged comes first, right after the wake-up, as it
+would in the car, and the others meet the same scenes at the same time; or they take turns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from eqrt.runtime.bench.report import (
 )
 from eqrt.runtime.bench.resources import cpu_ns
 from eqrt.runtime.bench.schedule import CLOCK, Clock, Turn
-from eqrt.runtime.bench.workload import Workload
+from eqrt.runtime.bench.workload import Timed, Workload
 
 WARM_UP_S = 0.5
 WARM_UP_RUNS = 20
@@ -68,27 +69,37 @@ def measure(
     *,
     between: Callable[[], None],
     should_stop: Callable[[], bool],
+    rotating: bool = False,
 ) -> Measurement:
     """Make the turns, or as many as come before `should_stop`; `between` is called after each.
+
+    `rotating`: another workload begins in every turn, instead of always the first.
 
     `expected`: about how many turns there will be; room for them is made first, so that keeping
     samples does not look like growing memory.
     """
-    samples = _Samples(_TURN + sum(len(w.stages) + 1 for w in workloads), expected)
+    samples = Samples(_TURN + sum(len(w.stages) + 1 for w in workloads), expected)
     for turn in turns:
-        row = [turn.number, turn.due_ns, turn.started_ns, int(turn.waited)]
-        for workload in workloads:
-            before_ns = cpu_ns()
-            row += workload.run(turn.number)
-            row.append(cpu_ns() - before_ns)
-        samples.append(row)
+        first = turn.number % len(workloads) if rotating else 0
+        parts = [_run(workload, turn.number) for workload in workloads[first:]]
+        parts[:0] = [_run(workload, turn.number) for workload in workloads[:first]]
+        samples.append(
+            [turn.number, turn.due_ns, turn.started_ns, int(turn.waited), *chain(*parts)]
+        )
         between()
         if should_stop():
             break
-    return _taken_apart(samples.rows(), workloads)
+    return taken_apart(samples.rows(), workloads)
 
 
-def results(workloads: Sequence[Workload], measured: Measurement) -> tuple[WorkloadResult, ...]:
+def _run(workload: Workload, number: int) -> list[int]:
+    """Its stages, and its CPU time."""
+    before_ns = cpu_ns()
+    stages_ns = workload.run(number)
+    return [*stages_ns, cpu_ns() - before_ns]
+
+
+def results(workloads: Sequence[Timed], measured: Measurement) -> tuple[WorkloadResult, ...]:
     """The samples of each workload, summed up. Needs one turn at least."""
     started_ns = measured.turns[:, 2]
     return tuple(
@@ -153,7 +164,7 @@ def course(started_ns: Int64, samples_ns: Int64) -> Course:
 
 
 def _result(
-    workload: Workload, stages_ns: Int64, spent_ns: Int64, started_ns: Int64
+    workload: Timed, stages_ns: Int64, spent_ns: Int64, started_ns: Int64
 ) -> WorkloadResult:
     total_ns = stages_ns.sum(axis=1)
     return WorkloadResult(
@@ -170,14 +181,15 @@ def _result(
     )
 
 
-def _taken_apart(rows: Int64, workloads: Sequence[Workload]) -> Measurement:
+def taken_apart(rows: Int64, workloads: Sequence[Timed]) -> Measurement:
+    """Rows of a turn (number, due, started, waited), then stages and CPU time of each workload."""
     parts = list(_columns(rows[:, _TURN:], workloads))
     return Measurement(
         rows[:, :_TURN], tuple(part[:, :-1] for part in parts), tuple(part[:, -1] for part in parts)
     )
 
 
-def _columns(rows: Int64, workloads: Sequence[Workload]) -> Iterator[Int64]:
+def _columns(rows: Int64, workloads: Sequence[Timed]) -> Iterator[Int64]:
     at = 0
     for workload in workloads:
         width = len(workload.stages) + 1
@@ -185,7 +197,7 @@ def _columns(rows: Int64, workloads: Sequence[Workload]) -> Iterator[Int64]:
         at += width
 
 
-class _Samples:
+class Samples:
     """Rows of whole numbers, in memory that has been touched before it is needed."""
 
     def __init__(self, width: int, expected: int) -> None:
@@ -193,6 +205,7 @@ class _Samples:
         self._used = 0
 
     def append(self, row: Sequence[int]) -> None:
+        """One more."""
         if self._used == len(self._chunks[-1]):
             self._chunks.append(np.full((_CHUNK, len(row)), -1, np.int64))
             self._used = 0

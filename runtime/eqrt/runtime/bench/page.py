@@ -8,7 +8,7 @@ from html import escape
 from eqrt.runtime.bench.baseline import Comparison
 from eqrt.runtime.bench.charts import course_chart, histogram_chart, stages_chart
 from eqrt.runtime.bench.percentiles import CONFIDENCE, PERCENTILES
-from eqrt.runtime.bench.report import Case, Distribution, Report, WorkloadResult, counted
+from eqrt.runtime.bench.report import GENERATED, SERVICE, Case, Distribution, Report, WorkloadResult
 from eqrt.runtime.bench.table import interval, ms
 
 _STYLE = """
@@ -43,7 +43,7 @@ svg .slowest { stroke: var(--mark); stroke-width: 1; }
 
 def render_page(report: Report, comparison: Comparison | None = None) -> str:
     """The text of the page, and what changed since a baseline."""
-    title = f"eqrt bench: {report.model.name} {report.model.version}"
+    title = f"eqrt bench: {report.model.name} {report.model.version}{_whole(report)}"
     body = [
         f"<h1>{escape(title)}</h1>",
         *_heading(report),
@@ -63,6 +63,10 @@ def render_page(report: Report, comparison: Comparison | None = None) -> str:
     )
 
 
+def _whole(report: Report) -> str:
+    return ", the whole service" if report.settings.benchmark == SERVICE else ""
+
+
 def _heading(report: Report) -> Iterator[str]:
     settings, start = report.settings, report.cold_start
     yield (
@@ -80,7 +84,7 @@ def _heading(report: Report) -> Iterator[str]:
 
 def _case(case: Case) -> Iterator[str]:
     judged = case.judged
-    yield f"<h2>{counted(case.targets)}</h2>"
+    yield f"<h2>{case.title}</h2>"
     yield f"<p>{_verdict(case.valid)} {escape('; '.join(case.reasons))}</p>"
     yield _table(("ms", *PERCENTILES, "max", "CPU", "samples"), _rows(case))
     yield from _list(case.advice)
@@ -135,7 +139,11 @@ def _costs(case: Case) -> Iterator[Sequence[str]]:
 
 def _facts(report: Report) -> Iterator[Sequence[str]]:
     environment = report.environment
+    settings = report.settings
     yield "model", f"{report.model.name} {report.model.version}"
+    if settings.bus is not None:
+        yield "bus", settings.bus
+        yield "traffic", settings.log or GENERATED
     yield "SHA-256", report.model.sha256
     yield "processor", environment.cpu
     yield "instructions", " ".join(environment.flags)
@@ -152,7 +160,7 @@ def _comparison(comparison: Comparison) -> Iterator[str]:
     yield "<h2>Beside the baseline</h2>"
     rows = [
         (
-            f"{counted(change.targets)}, {change.percentile}",
+            f"{change.title}, {change.percentile}",
             interval(change.before),
             interval(change.now),
             f"{change.ratio:.3f}{' *' if change.significant else ''}",

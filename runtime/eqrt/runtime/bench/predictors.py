@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from eqrt.core.contract import ModelContract
+from eqrt.core.kalman import kalman
 from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
 from eqrt.core.scene import Scene
+from eqrt.runtime.bench.report import MODEL
 from eqrt.runtime.bench.scenes import ScenePool
 from eqrt.runtime.bench.schedule import CLOCK, Clock
 from eqrt.runtime.prediction.predictor import Predictor
-
-MODEL = "model"
-"""The name of the workload that is judged; the others are there for comparison."""
 
 
 class TimedSession:
@@ -46,6 +45,11 @@ class TimedPredictor(Predictor):
         super().__init__(self.session, contract, sha256, metadata)
         self.sha256 = sha256
         """Of `model.onnx`, all 64 digits."""
+        self._metadata = metadata
+
+    def with_session(self, session: Any) -> TimedPredictor:
+        """The same model, run by another session."""
+        return TimedPredictor(session, self.contract, self.sha256, self._metadata)
 
 
 def load_timed(artifact: Path, threads: int) -> TimedPredictor:
@@ -56,12 +60,14 @@ def load_timed(artifact: Path, threads: int) -> TimedPredictor:
 class ModelWorkload:
     """One prediction of so many targets."""
 
-    name = MODEL
     stages = ("gather", "infer", "map frame")
     """Taking the targets' inputs from the pool; running the graph; everything else that
     `Predictor.predict` does: cutting batches, joining results, going back to the map frame."""
 
-    def __init__(self, predictor: TimedPredictor, pool: ScenePool, targets: int) -> None:
+    def __init__(
+        self, predictor: TimedPredictor, pool: ScenePool, targets: int, name: str = MODEL
+    ) -> None:
+        self.name = name
         self._predictor = predictor
         self._pool = pool
         self._targets = targets
@@ -116,7 +122,16 @@ def _constant_turn(scene: Scene, horizon_steps: int, dt_s: float) -> Any:
     return constant_turn(now, velocity, turn_rate_rad_s, horizon_steps, dt_s) + scene.origin
 
 
-PHYSICS = {"constant velocity": _constant_velocity, "constant turn": _constant_turn}
+def _kalman(scene: Scene, horizon_steps: int, dt_s: float) -> Any:
+    history, valid = _own_history(scene)
+    return kalman(history, valid, horizon_steps, dt_s) + scene.origin
+
+
+PHYSICS = {
+    "constant velocity": _constant_velocity,
+    "constant turn rate": _constant_turn,
+    "Kalman filter": _kalman,
+}
 
 
 def _own_history(scene: Scene) -> tuple[Any, Any]:
@@ -124,15 +139,7 @@ def _own_history(scene: Scene) -> tuple[Any, Any]:
     return scene.history[:, 0].astype(np.float64), scene.history_valid[:, 0]
 
 
-def workloads(
-    predictor: TimedPredictor, pool: ScenePool, targets: int
-) -> tuple[ModelWorkload | PhysicsWorkload, ...]:
-    """The model first, then physics."""
-    contract = predictor.contract
-    return (
-        ModelWorkload(predictor, pool, targets),
-        *(
-            PhysicsWorkload(name, pool, targets, contract.horizon_steps, contract.dt_s)
-            for name in PHYSICS
-        ),
-    )
+def physics(contract: ModelContract, pool: ScenePool, targets: int) -> tuple[PhysicsWorkload, ...]:
+    """All of PHYSICS, on the scenes that a model of this contract is asked about."""
+    steps, dt_s = contract.horizon_steps, contract.dt_s
+    return tuple(PhysicsWorkload(name, pool, targets, steps, dt_s) for name in PHYSICS)

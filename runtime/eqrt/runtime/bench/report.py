@@ -6,7 +6,9 @@ field; SCHEMA changes when one of them changes its meaning or goes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from eqrt.runtime.bench.cold_start import ColdStart
 from eqrt.runtime.bench.environment import Environment, ModelIdentity
@@ -18,9 +20,17 @@ BACK_TO_BACK, PERIODIC = "back-to-back", "periodic"
 SCHEDULES = (BACK_TO_BACK, PERIODIC)
 
 
-def counted(targets: int) -> str:
-    """`1 target`, `8 targets`."""
-    return f"{targets} target{'s' * (targets != 1)}"
+MODEL, SERVICE = "model", "service"
+"""What is benchmarked, and the name of the workload that is judged then."""
+GENERATED = "generated: the recorded drive of eqrt demo, filled up with copies"
+"""The traffic of a service benchmark without a log."""
+NOUNS = {MODEL: "target", SERVICE: "object"}
+"""What there is a number of in a case."""
+
+
+def counted(targets: int, benchmark: str = MODEL) -> str:
+    """`1 target`, `8 targets`; of the service, objects."""
+    return f"{targets} {NOUNS[benchmark]}{'s' * (targets != 1)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +98,7 @@ class Case:
     """One number of targets, measured once."""
 
     targets: int
+    """In each prediction; of the service, the objects in each cycle of the traffic."""
     seconds: float
     """That it ran."""
     workloads: tuple[WorkloadResult, ...]
@@ -104,6 +115,15 @@ class Case:
         """Whether nothing speaks against the figures."""
         return not self.reasons
 
+    def advised(self, more: Sequence[str]) -> Case:
+        """With more advice."""
+        return replace(self, advice=(*self.advice, *more))
+
+    @property
+    def title(self) -> str:
+        """`8 targets`, `8 objects`."""
+        return counted(self.targets, SERVICE if self.judged.name == SERVICE else MODEL)
+
     @property
     def judged(self) -> WorkloadResult:
         """The workload that verdict, budget and baseline are about."""
@@ -115,7 +135,7 @@ class Settings:
     """What was asked for."""
 
     benchmark: str
-    """`model`: predictions of ready scenes."""
+    """`model`: predictions of ready scenes; `service`: from the bus to the bus."""
     targets: tuple[int, ...]
     seconds: float
     """Per case."""
@@ -124,6 +144,10 @@ class Settings:
     rate_hz: float | None
     """None back-to-back."""
     threads: int
+    bus: str | None = None
+    """Of the service: channel and interface."""
+    log: str | None = None
+    """Of the service: the recorded log that is played; None = generated traffic."""
 
     def duty(self) -> str:
         """The schedule in words."""
@@ -150,3 +174,22 @@ class Report:
         """Whether every case asked for was measured, and is valid."""
         complete = len(self.cases) == len(self.settings.targets)
         return complete and all(case.valid for case in self.cases)
+
+
+def report_now(
+    settings: Settings,
+    environment: Environment,
+    model: ModelIdentity,
+    cold_start: ColdStart,
+    cases: Sequence[Case],
+) -> Report:
+    """A report that was just measured."""
+    return Report(
+        schema=SCHEMA,
+        measured_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        settings=settings,
+        environment=environment,
+        model=model,
+        cold_start=cold_start,
+        cases=tuple(cases),
+    )

@@ -10,12 +10,13 @@ from eqrt.runtime.bench.cold_start import ColdStart
 from eqrt.runtime.bench.environment import Environment, ModelIdentity
 from eqrt.runtime.bench.percentiles import CONFIDENCE, PERCENTILES, Estimate
 from eqrt.runtime.bench.report import (
+    GENERATED,
+    NOUNS,
     Case,
     Distribution,
     Punctuality,
     Report,
     Settings,
-    counted,
 )
 from eqrt.runtime.bench.resources import Resources
 
@@ -27,9 +28,37 @@ def heading_lines(
     settings: Settings, environment: Environment, model: ModelIdentity, cold_start: ColdStart
 ) -> list[str]:
     """What is measured where, and the cold start."""
+    return model_lines(settings, environment, model) + _wrapped(
+        f"cold start {cold_start.total_s:.2f} s, slowest of {cold_start.starts} "
+        f"{cold_start.slowest_s:.2f} s (import {cold_start.import_s:.2f}, load "
+        f"{cold_start.load_s:.2f}, first answer {1e3 * cold_start.first_s:.1f} ms); memory "
+        f"{cold_start.rss_mib:.1f} MiB, of which numpy and onnxruntime "
+        f"{cold_start.rss_bare_mib:.1f}",
+    )
+
+
+def model_lines(settings: Settings, environment: Environment, model: ModelIdentity) -> list[str]:
+    """What is measured where."""
+    service = []
+    if settings.bus is not None:
+        service.append(f"the service on {settings.bus}; traffic {settings.log or GENERATED}")
+    return _wrapped(
+        f"{model.name} {model.version} ({model.sha256[:8]}), {duty(settings)}",
+        *service,
+        *machine(environment),
+    )
+
+
+def duty(settings: Settings) -> str:
+    """`1 thread, back-to-back, 20 s a case`."""
     threads = f"{settings.threads} thread{'s' * (settings.threads != 1)}"
+    return f"{threads}, {settings.duty()}, {settings.seconds:g} s a case"
+
+
+def machine(environment: Environment) -> list[str]:
+    """Hardware; software."""
     cores = ",".join(map(str, environment.cores_allowed))
-    machine = [
+    parts = [
         environment.cpu,
         f"cores {cores} of {environment.cores_present}",
         f"governor {environment.governor}" if environment.governor else "",
@@ -40,23 +69,13 @@ def heading_lines(
         f"{name} {getattr(environment, name)}"
         for name in ("eqrt", "python", "numpy", "onnxruntime")
     ]
-    return _wrapped(
-        f"{model.name} {model.version} ({model.sha256[:8]}), {threads}, {settings.duty()}, "
-        f"{settings.seconds:g} s a case",
-        ", ".join(part for part in machine if part),
-        ", ".join(versions),
-        f"cold start {cold_start.total_s:.2f} s, slowest of {cold_start.starts} "
-        f"{cold_start.slowest_s:.2f} s (import {cold_start.import_s:.2f}, load "
-        f"{cold_start.load_s:.2f}, first answer {1e3 * cold_start.first_s:.1f} ms); memory "
-        f"{cold_start.rss_mib:.1f} MiB, of which numpy and onnxruntime "
-        f"{cold_start.rss_bare_mib:.1f}",
-    )
+    return [", ".join(part for part in parts if part), ", ".join(versions)]
 
 
 def case_lines(case: Case) -> list[str]:
     """One number of targets: percentiles of every workload, resources, verdict, advice."""
     names = [*PERCENTILES, "max", "CPU"]
-    title = f"{counted(case.targets)}, ms"
+    title = f"{case.title}, ms"
     lines = [
         "",
         f"{title:<{_NAME}}" + "".join(f"{name:>{_COLUMN}}" for name in names) + "  samples",
@@ -79,8 +98,9 @@ def closing_lines(report: Report) -> list[str]:
     if report.valid:
         return ["", "VALID"]
     bad = [str(case.targets) for case in report.cases if not case.valid]
+    noun = NOUNS[report.settings.benchmark]
     missing = len(report.settings.targets) - len(report.cases)
-    parts = [f"targets {', '.join(bad)}"] if bad else []
+    parts = [f"{noun}s {', '.join(bad)}"] if bad else []
     parts += [f"{missing} cases not measured"] if missing else []
     return ["", f"INVALID: {'; '.join(parts)}: measure again on a quiet machine"]
 
@@ -91,7 +111,7 @@ def comparison_lines(comparison: Comparison) -> list[str]:
     for change in comparison.changes:
         mark = " *" if change.significant else "  "
         lines.append(
-            f"{f'{counted(change.targets)}, {change.percentile}':<26}{interval(change.before):>24}"
+            f"{f'{change.title}, {change.percentile}':<26}{interval(change.before):>24}"
             f"{interval(change.now):>28}{change.ratio:>12.3f}{mark}"
         )
     lines.append(f"* the intervals ({CONFIDENCE:.0%}) are apart")
@@ -111,7 +131,11 @@ def _row(name: str, distribution: Distribution, more: str = "") -> str:
     found = distribution.percentiles
     cells = [ms(found[key].value_ns) if key in found else "-" for key in PERCENTILES]
     cells.append(ms(distribution.max_ns))
-    return f"{name:<{_NAME}}" + "".join(f"{cell:>{_COLUMN}}" for cell in cells) + more
+    return f"{_shortened(name):<{_NAME}}" + "".join(f"{cell:>{_COLUMN}}" for cell in cells) + more
+
+
+def _shortened(name: str) -> str:
+    return name if len(name) < _NAME else f"{name[: _NAME - 2]}…"
 
 
 def _confidence(found: Mapping[str, Estimate]) -> str:

@@ -25,6 +25,7 @@ _LONG_TAIL = 3.0
 _SLOW_WAKE_UP_NS = 1_000_000
 _LEAK_KIB_PER_S = 10.0
 _WASTED_CPU = 1.2  # CPU time per time taken, with several threads
+_WORTH_THREADS = 1.1  # times as fast as one
 
 
 def reasons(
@@ -48,12 +49,13 @@ def advice(
 ) -> tuple[str, ...]:
     """What a reader should know or try, a line each."""
     return (
-        *_tail(judged),
+        *_tail(settings, judged),
         *_more_samples(settings, judged),
         *_threads(settings, judged),
         *_ticks(punctuality),
+        *_wake_up(judged, punctuality),
         *_memory(resources),
-        *_machine(environment),
+        *_machine(environment, resources),
     )
 
 
@@ -91,11 +93,14 @@ def _reasons(
         yield f"the cores' clock went from {low:.0f} to {high:.0f} MHz"
 
 
-def _tail(judged: WorkloadResult) -> Iterator[str]:
+def _tail(settings: Settings, judged: WorkloadResult) -> Iterator[str]:
     found = judged.total.percentiles
     if "p99" in found and found["p99"].value_ns > _LONG_TAIL * found["p50"].value_ns:
         ratio = found["p99"].value_ns / found["p50"].value_ns
-        yield f"p99 is {ratio:.1f} x p50: other work on these cores? see --cpus"
+        why = "other work on these cores? see --cpus"
+        if settings.threads > 1:
+            why = "threads wait for each other: --threads 1 is steadier"
+        yield f"p99 is {ratio:.1f} x p50: {why}"
 
 
 def _more_samples(settings: Settings, judged: WorkloadResult) -> Iterator[str]:
@@ -110,6 +115,22 @@ def _more_samples(settings: Settings, judged: WorkloadResult) -> Iterator[str]:
                 f"--seconds {ceil(seconds)}"
             )
             return
+
+
+def alone_advice(settings: Settings, judged: WorkloadResult, alone_ns: int) -> tuple[str, ...]:
+    """Whether several threads are worth it, beside the median of one, measured just after."""
+    gain = alone_ns / max(_median_ns(judged), 1)
+    if settings.threads == 1 or gain > _WORTH_THREADS:
+        return ()
+    return (
+        f"{settings.threads} threads gain next to nothing at this size, {gain:.2f} x the speed of "
+        f"one ({alone_ns / 1e6:.3f} ms): --threads 1 leaves the other cores free",
+    )
+
+
+def _median_ns(judged: WorkloadResult) -> int:
+    found = judged.total.percentiles.get("p50")
+    return judged.total.mean_ns if found is None else found.value_ns
 
 
 def _threads(settings: Settings, judged: WorkloadResult) -> Iterator[str]:
@@ -129,7 +150,11 @@ def _ticks(punctuality: Punctuality | None) -> Iterator[str]:
             f"{punctuality.misses:,} of {punctuality.ticks:,} deadlines missed: fewer targets, "
             "a smaller model, or a lower rate"
         )
-    wake_up = punctuality.wake_up
+
+
+def _wake_up(judged: WorkloadResult, punctuality: Punctuality | None) -> Iterator[str]:
+    """Of a run that was due; of the service, until it has the message."""
+    wake_up = judged.stages.get("wake-up", punctuality.wake_up if punctuality else None)
     found = wake_up.percentiles.get("p99") if wake_up else None
     if found is not None and found.value_ns > _SLOW_WAKE_UP_NS:
         yield (
@@ -146,7 +171,9 @@ def _memory(resources: Resources) -> Iterator[str]:
         yield f"{resources.major_faults:,} pages came from disk: is memory short?"
 
 
-def _machine(environment: Environment) -> Iterator[str]:
+def _machine(environment: Environment, resources: Resources) -> Iterator[str]:
+    if resources.steal_share > MAX_STEAL:
+        yield "the hypervisor takes time from these cores: a machine with cores of its own"
     if environment.governor not in (None, "performance"):
         yield f"the frequency governor is {environment.governor!r}: performance is steadier"
     if "avx2" not in environment.flags and not any("asimd" in f for f in environment.flags):

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 
-class Workload(Protocol):
-    """Runs number 0, 1, 2, ...; each on other input, the same input for the same number."""
+class Timed(Protocol):
+    """What samples are of."""
 
     @property
     def name(self) -> str:
@@ -16,6 +16,10 @@ class Workload(Protocol):
     @property
     def stages(self) -> tuple[str, ...]:
         """The parts of one run, in order."""
+
+
+class Workload(Timed, Protocol):
+    """Runs number 0, 1, 2, ...; each on other input, the same input for the same number."""
 
     def run(self, number: int) -> Sequence[int]:
         """Run once; nanoseconds spent in each stage. Their sum is the time of the run."""

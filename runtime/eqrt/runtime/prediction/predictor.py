@@ -165,7 +165,14 @@ def _read_checked(folder: Path) -> bytes:
     return content
 
 
-def _session(content: bytes, folder: Path, threads: int) -> onnxruntime.InferenceSession:
+def open_session(
+    content: bytes, threads: int, *, profile: Path | None = None, prepack: bool = True
+) -> onnxruntime.InferenceSession:
+    """A model file's bytes as the car runs them; raises whatever onnxruntime does.
+
+    `profile`: what the name of a file of the time in every node begins with, written when the
+    session's `end_profiling` is called. `prepack`: bring weights into the order they are used in.
+    """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read when onnxruntime is first imported
     import onnxruntime  # noqa: PLC0415 (so that the line above comes first)
 
@@ -173,15 +180,25 @@ def _session(content: bytes, folder: Path, threads: int) -> onnxruntime.Inferenc
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.disable_prepacking", "0" if prepack else "1")
     options.log_severity_level = 3
+    if profile is not None:
+        options.enable_profiling = True
+        options.profile_file_prefix = str(profile)
+    return onnxruntime.InferenceSession(
+        content,
+        options,
+        providers=["CPUExecutionProvider"],
+        disabled_optimizers=["SkipLayerNormFusion"],  # slower on a CPU than Add + LayerNorm
+    )
+
+
+def _session(content: bytes, folder: Path, threads: int) -> onnxruntime.InferenceSession:
     try:
-        return onnxruntime.InferenceSession(
-            content,
-            options,
-            providers=["CPUExecutionProvider"],
-            disabled_optimizers=["SkipLayerNormFusion"],  # slower on a CPU than Add + LayerNorm
-        )
+        return open_session(content, threads)
     except Exception as error:  # onnxruntime raises its own classes, with no common base
+        import onnxruntime  # noqa: PLC0415 (as above)
+
         first_line = str(error).splitlines()[0]
         raise ContractError(
             f"{folder / 'model.onnx'}: onnxruntime {onnxruntime.__version__} cannot load it "

@@ -1,4 +1,7 @@
-"""Walks protocol buffer messages without the protobuf package: field numbers and raw values."""
+"""Protocol buffer messages without the protobuf package: field numbers and raw values.
+
+`fields` walks through a message; `number`, `text` and `nested` make the fields of one.
+"""
 
 from __future__ import annotations
 
@@ -40,6 +43,29 @@ def varints(packed: memoryview) -> Iterator[int]:
     while at < len(packed):
         value, at = _varint(packed, at)
         yield value
+
+
+def number(field: int, value: int) -> bytes:
+    """A field that is a whole number, 0 or more."""
+    return _written(field << 3 | _VARINT) + _written(value)
+
+
+def text(field: int, value: str) -> bytes:
+    """A field that is text."""
+    return nested(field, value.encode())
+
+
+def nested(field: int, content: bytes) -> bytes:
+    """A field that is a message, or bytes."""
+    return _written(field << 3 | _BYTES) + _written(len(content)) + content
+
+
+def _written(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
 
 
 def _varint(view: memoryview, at: int) -> tuple[int, int]:

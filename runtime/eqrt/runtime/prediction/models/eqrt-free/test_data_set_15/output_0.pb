@@ -1,1 +1,2 @@
-BtrajectoriesJð4(ØÃ¦RUC_wØÃ YVCKÇØÃŸ_WCÙÃ¯eXCÒiÙÃÿjYC~¼ÙÃ\oZCÚÃ©r[C‹dÚÃÝt\CÏ¹ÚÃüu]CÍÛÃv^CrfÛÃAu_C©½ÛÃ—s`CaÜÃ4qaC‹mÜÃ1nbCÆÜÃ¥jcCÝÃ¤fdCNxÝÃ9beCéÑÝÃn]fCÙ+ÞÃBXgC"†ÞÃ²RhCÄàÞÃµLiCÁ;ßÃ=FjC—ßÃ<?kCÂòßÃ¢7lC±NàÃb/mCÐªàÃu&nCùáÃÜoCûbáÃ¤pC¾áÃêqCXâÃâüqC
+BtrajectoriesJð÷(ØÃËSUCäxØÃJZVC’ÉØÃ3`WC!ÙÃoeXCŸmÙÃîiYCÁÙÃ mZCxÚÃyp[CÄjÚÃqr\CêÀÚÃ‚s]CÖÛÃªs^CxoÛÃér_C½ÇÛÃAq`C• ÜÃ¶naCñyÜÃOkbCÅÓÜÃgcC
+.ÝÃbdC¹ˆÝÃF\eCÏãÝÃÈUfCL?ÞÃ›NgC1›ÞÃÈFhC÷ÞÃX>iC;TßÃM5jCa±ßÃ«+kCíàÃp!lCÕlàÃ–mCËàÃnCd)áÃÒþnCÅ‡áÃ¾ñoCíåáÃ¶ãpCCâÃ’ÔqC

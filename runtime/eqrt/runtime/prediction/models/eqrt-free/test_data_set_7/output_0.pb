@@ -1,2 +1,1 @@
-BtrajectoriesJðüØÃMËTC’/ØÃIUCí^ØÃÝÄUC³ØÃ„=VCžÄØÃ\²VCtúØÃî"WC
-2ÙÃøŽWC=kÙÃ_öWCð¥ÙÃ*YXCâÙÃq·XC~ÚÃ_YC2^ÚÃ!gYCžÚÃè¸YCßÚÃãZC!ÛÃ9QZCdÛÃ˜ZCë§ÛÃcÛZC‚ìÛÃX[CÃ1ÜÃçW[C•wÜÃ‘[Cá½ÜÃÂÆ[C’ÝÃù[C›KÝÃÏ'\Có’ÝÃ9S\C›ÚÝÃg{\C¡"ÞÃŸ \C"kÞÃPÃ\CL´ÞÃä\CeþÞÃð]CÌIßÃù#]C
+BtrajectoriesJð-ØÃ8ÍTCn,ØÃ*NUCJXØÃãÍUC°…ØÃ"KVC†´ØÃÅVCµäØÃ,;WC!ÙÃ6­WC²HÙÃ%XCJ|ÙÃ…XCÏ°ÙÃ4ëXC&æÙÃÈMYC6ÚÃ­YCæRÚÃX	ZCŠÚÃÍbZCÌÁÚÃœ¹ZCØùÚÃà[C22ÛÃ¢_[CÊjÛÃÛ®[C’£ÛÃyû[C~ÜÛÃ`E\C‚ÜÃsŒ\C–NÜÃ˜Ð\C²‡ÜÃÇ]CÐÀÜÃP]CêùÜÃ±‹]Cú2ÝÃÅ]CúkÝÃôü]Cæ¤ÝÃ_4^C¶ÝÝÃÑl^CaÞÃK¨^C

@@ -1,0 +1,1 @@
+"""How fast the whole service answers on a bus: traffic, service and measuring are processes."""
