@@ -14,6 +14,7 @@ from torch import nn
 
 from eqrt.core.contract import METADATA_KEY, ModelContract
 from eqrt.core.errors import EqrtError
+from eqrt.export.folded import folded
 
 OPSET = 18
 IR_VERSION = 8
@@ -29,7 +30,7 @@ def to_onnx(model: nn.Module, contract: ModelContract, metadata: dict[str, str])
 
     Raises EqrtError if the graph needs an operator that the artifact must not contain.
     """
-    proto = _export(model.eval(), contract)
+    proto = _export(folded(model.eval(), contract.num_agents).eval(), contract)
     _clean(proto)
     _describe(proto, contract, metadata)
     forbidden = {node.op_type for node in proto.graph.node} & FORBIDDEN_OPS

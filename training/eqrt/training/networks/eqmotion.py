@@ -108,7 +108,7 @@ class EqMotion(nn.Module):
         map_points = self.frame(
             history[:, 0], history_valid[:, 0], heading, centerlines, centerlines_valid
         )
-        from_map, vectors = self.read_map(map_points)
+        from_map, vectors = read_map(self.map, self.fusion, map_points, in_metres=self.in_metres)
         geometric, pattern = self.initial((held - origin) / UNIT_M, history_valid, agents, from_map)
         if vectors is not None:
             geometric = torch.cat([geometric[:, :1] + vectors, geometric[:, 1:]], 1)
@@ -125,16 +125,22 @@ class EqMotion(nn.Module):
         logits = None if self.logits is None else self.logits(target)
         return most_probable_first(origin + UNIT_M * trajectories, logits)
 
-    def read_map(self, points: MapPoints) -> tuple[Tensor | None, Tensor | None]:
-        """What the map adds to every H (B, 1, D), and to the target's G (B, 1, 2, C)."""
-        if self.map is None or self.fusion is None:
-            return None, None
-        if self.in_metres:
-            feature = self.map(UNIT_M * points.points, points.valid)
-        else:
-            feature = self.map(points.points.flatten(1, 2), points.valid.flatten(1))
-        from_map, vectors = self.fusion(feature, points.tile_from_frame)
-        return from_map, vectors
+
+def read_map(
+    encoder: nn.Module | None, fusion: MapFusion | None, points: MapPoints, *, in_metres: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    """What the map adds to every H (B, 1, D), and to the target's G (B, 1, 2, C).
+
+    `in_metres` is what the encoder reads; else tokens in network units, all in a row.
+    """
+    if encoder is None or fusion is None:
+        return None, None
+    if in_metres:
+        feature = encoder(UNIT_M * points.points, points.valid)
+    else:
+        feature = encoder(points.points.flatten(1, 2), points.valid.flatten(1))
+    from_map, vectors = fusion(feature, points.tile_from_frame)
+    return from_map, vectors
 
 
 def map_encoder(scene: SceneConfig, config: EqMotionConfig) -> nn.Module | None:

@@ -16,7 +16,7 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
-_TINY = 1e-3  # a centimetre in network units; its square must stay above 1e-8 (canonical.py)
+TINY = 1e-3  # a centimetre in network units; its square must stay above 1e-8 (canonical.py)
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -39,7 +39,7 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 def length(vectors: Tensor) -> Tensor:
     """Lengths of vectors (..., 2, C): (..., C); smooth at zero, where a norm has no gradient."""
-    return (dot(vectors, vectors) + _TINY**2).sqrt()
+    return (dot(vectors, vectors) + TINY**2).sqrt()
 
 
 class VectorNonlinearity(nn.Module):
@@ -56,7 +56,7 @@ class VectorNonlinearity(nn.Module):
     def forward(self, geometric: Tensor) -> Tensor:
         """(..., 2, C) -> (..., 2, C)."""
         query, key = self.query(geometric), self.key(geometric)
-        against = dot(query, key).clamp(max=0.0) / (dot(key, key) + _TINY)  # (..., C) does not turn
+        against = dot(query, key).clamp(max=0.0) / (dot(key, key) + TINY)  # (..., C) does not turn
         kept: Tensor = query - against.unsqueeze(-2) * key
         return kept
 
