@@ -108,7 +108,8 @@ def naive_means(query: Tensor, key: Tensor, points: Tensor, valid: Tensor) -> Te
     whole = torch.cat([points, torch.ones_like(points[..., :1])], -1)
     score = (whole @ query.T) @ (whole @ key.T).transpose(-1, -2) / len(query) ** 0.5
     share = score.masked_fill(~valid.unsqueeze(1), -torch.inf).softmax(-1)
-    return share @ points
+    means: Tensor = share @ points
+    return means
 
 
 @pytest.mark.parametrize("spread", [1.0, 300.0])
