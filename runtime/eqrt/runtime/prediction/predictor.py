@@ -185,12 +185,14 @@ def open_session(
     if profile is not None:
         options.enable_profiling = True
         options.profile_file_prefix = str(profile)
-    return onnxruntime.InferenceSession(
+    session = onnxruntime.InferenceSession(
         content,
         options,
         providers=["CPUExecutionProvider"],
         disabled_optimizers=["SkipLayerNormFusion"],  # slower on a CPU than Add + LayerNorm
     )
+    session._model_bytes = None  # the whole file, kept to begin anew elsewhere than on the CPU
+    return session
 
 
 def _session(content: bytes, folder: Path, threads: int) -> onnxruntime.InferenceSession:
