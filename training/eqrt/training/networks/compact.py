@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from eqrt.training.networks.canonical import exact
-from eqrt.training.networks.config import SceneConfig
+from eqrt.training.networks.config import UNIT_M, SceneConfig
 from eqrt.training.networks.layers import mlp
 from eqrt.training.networks.motion import SLOPE_STEPS
 from eqrt.training.networks.spread import SpreadDecoder, tile_covariances
@@ -35,7 +35,6 @@ from eqrt.training.networks.target_view import TOKENS, TargetView
 from eqrt.training.networks.time_basis import BASIS, time_basis
 
 _MASKED = 1e9  # a finite infinity: a row without any valid token must not become NaN
-_SCALE_M = 10.0  # what is drawn is in tens of metres, so that weights are about 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,7 +159,7 @@ class ModeDecoder(nn.Module):
             list(self.draw.parameters())[-2].mul_(0.1)  # training starts near the mean course
         self.logit = mlp([width, width, 1]) if scene.num_modes > 1 else None
         time = torch.arange(1, self.steps + 1) * scene.dt_s
-        basis = torch.cat([time.unsqueeze(0), _SCALE_M * time_basis(self.steps)])
+        basis = torch.cat([time.unsqueeze(0), UNIT_M * time_basis(self.steps)])
         self.register_buffer("basis", basis.T.contiguous(), persistent=False)
         spread = SpreadDecoder(width, self.steps, scene.dt_s) if config.uncertainty else None
         self.spread = spread  # last, so that all other weights start as they would without

@@ -113,7 +113,7 @@ class TargetView(nn.Module):
             ways, defined = point_directions(points, valid)
             both = torch.stack([points, ways], -1).flatten(2, 3)  # (B, 2, Q L, 2)
             return _turned(turn, both), (valid * defined).flatten(2)
-        lines = _turned(turn, points)  # (B, Q, 2 L)
+        lines = _turned(turn, points)  # (B, 1, Q, 2 L)
         return torch.cat([lines, valid], -1), valid.amax(-1)
 
 
