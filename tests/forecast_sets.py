@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from eqrt.core.frames import Pose2
+from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 
-H, K, DT_S = 30, 2, 0.1
+T, H, K, DT_S = 20, 30, 2, 0.1
+PAST_M = 10.0 * DT_S * np.arange(1 - T, 1)
 
 
 def one_car() -> ForecastSet:
@@ -31,6 +33,7 @@ def one_car() -> ForecastSet:
         model_id="0123456789ab",
         tile_id="",
         map_from_ego=Pose2(100.0, 200.0, math.pi / 2),
+        ego_speed_mps=8.0,
         dt_s=DT_S,
         track_id=np.array([65_537]),
         object_id=np.array([17]),
@@ -38,6 +41,12 @@ def one_car() -> ForecastSet:
         agent_mode=np.array([Mode.PARTIAL], np.uint8),
         position=np.array([[100.0, 220.0]]),
         velocity=np.array([[0.0, 10.0]]),
+        heading_rad=np.array([math.pi / 2]),
+        object_class=np.array([ObjectClass.CAR], np.uint8),
+        length_m=np.array([4.5]),
+        width_m=np.array([np.nan]),
+        history=np.stack([np.full(T, 100.0), 220.0 + PAST_M], axis=-1)[None],
+        history_valid=np.arange(T)[None] >= T - 7,
         trajectories=np.stack([north, stay])[None],
         probabilities=np.array([[0.75, 0.25]]),
     )
@@ -45,22 +54,7 @@ def one_car() -> ForecastSet:
 
 def nobody(mode: Mode = Mode.SILENT) -> ForecastSet:
     """A cycle without targets."""
-    return select(replace(one_car(), mode=mode), slice(0))
-
-
-def select(forecasts: ForecastSet, rows: slice) -> ForecastSet:
-    """Some of the targets."""
-    return replace(
-        forecasts,
-        track_id=forecasts.track_id[rows],
-        object_id=forecasts.object_id[rows],
-        anchor_s=forecasts.anchor_s[rows],
-        agent_mode=forecasts.agent_mode[rows],
-        position=forecasts.position[rows],
-        velocity=forecasts.velocity[rows],
-        trajectories=forecasts.trajectories[rows],
-        probabilities=forecasts.probabilities[rows],
-    )
+    return replace(one_car(), mode=mode).targets(slice(0))
 
 
 def many(count: int, num_modes: int = 6, horizon: int = H, seed: int = 0) -> ForecastSet:
@@ -79,6 +73,7 @@ def many(count: int, num_modes: int = 6, horizon: int = H, seed: int = 0) -> For
         model_id="89abcdef0123",
         tile_id="fedcba98",
         map_from_ego=ego,
+        ego_speed_mps=13.5,
         dt_s=DT_S,
         track_id=np.arange(1000, 1000 + count),
         object_id=np.arange(count) % 256,
@@ -86,6 +81,12 @@ def many(count: int, num_modes: int = 6, horizon: int = H, seed: int = 0) -> For
         agent_mode=random.choice([Mode.RUN, Mode.PARTIAL, Mode.FALLBACK], count).astype(np.uint8),
         position=position,
         velocity=random.normal(0.0, 15.0, (count, 2)),
+        heading_rad=random.uniform(-math.pi, math.pi, count),
+        object_class=random.integers(0, 8, count).astype(np.uint8),
+        length_m=random.uniform(1.0, 15.0, count),
+        width_m=random.uniform(0.5, 2.5, count),
+        history=position[:, None] + random.normal(0.0, 20.0, (count, T, 2)),
+        history_valid=np.ones((count, T), np.bool_),
         trajectories=position[:, None, None] + steps.cumsum(axis=2),
         probabilities=probabilities,
     )

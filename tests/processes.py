@@ -18,6 +18,7 @@ import can
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.output.datagrams import decode_datagram
 from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.status import ServiceStatus
 from source_tree import ROOT
 
 PATIENCE_S = 60.0  # for anything that a process should do at once
@@ -89,6 +90,7 @@ class Heard:
     def __init__(self, channel: str, ids: Sequence[int] | None = None) -> None:
         self.messages: list[can.Message] = []
         self.forecasts: list[ForecastSet] = []
+        self.statuses: list[ServiceStatus] = []
         self._bus = open_bus(channel, LOCAL, receive_ids=ids)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
@@ -105,7 +107,11 @@ class Heard:
     def _receive(self) -> None:
         while not self._ended.is_set():
             with contextlib.suppress(TimeoutError):
-                self.forecasts.append(decode_datagram(self._socket.recv(65_535)).forecasts)
+                heard = decode_datagram(self._socket.recv(65_535))
+                if isinstance(heard, ServiceStatus):
+                    self.statuses.append(heard)
+                else:
+                    self.forecasts.append(heard.forecasts)
 
     def __enter__(self) -> Self:
         for thread in self._threads:

@@ -52,7 +52,7 @@ def scenes_from_can(scenario: Scenario) -> list[Scene]:
     lanes = lane_map(scenario)
     _, info = decode(encode(lanes, TileInfo(name="t", source="t", credit="")), "t")
     predictor = Listening(Predictor.load(DEFAULT_ARTIFACT))
-    pipeline = Pipeline(load_profile("generic"), predictor, Tile(lanes, info))  # type: ignore[arg-type]  # listens, else the same
+    pipeline = Pipeline(load_profile("generic"), predictor, Tile(lanes, info, Path("encoded.tile")))  # type: ignore[arg-type]  # listens, else the same
     forecasts = list(replay(pipeline, drive_messages([scenario], RANGE_M)))
     assert len(forecasts) == len(choose_ego(scenario).step)
     assert all(forecast.num_targets for forecast in forecasts[1:])

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Iterable
 
 import can
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,10 +22,12 @@ from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.play import OTHERS, Player
 from eqrt.runtime.serve import Merged
-from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Report, Service
+from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Service
+from eqrt.runtime.status_book import StatusBook, status_line
 from forecast_sets import many, nobody, one_car
 
 CHANNELS = (f"service-{number}-{time.monotonic_ns()}" for number in itertools.count())
@@ -99,6 +102,9 @@ class Said:
     def publish(self, forecast: ForecastSet) -> None:
         self.forecasts.append(forecast)
 
+    def counts(self) -> dict[str, int]:
+        return {"said": len(self.forecasts)}
+
 
 class Queue:
     """What a driver holds for a service that was busy: the recorded radar's messages, stamped as
@@ -133,7 +139,7 @@ def radar() -> Pipeline:
 def test_a_busy_service_does_not_take_a_full_queue_for_silence(radar: Pipeline) -> None:
     """Of what came while it was held up, it predicts every cycle, at the cycle's own time."""
     said, queue = Said(), Queue(3.0)
-    Service(radar, queue, [said], print).run(queue.is_over)
+    Service(radar, queue, [said]).run(queue.is_over)
     assert Mode.SILENT not in {forecast.mode for forecast in said.forecasts}
     assert len(said.forecasts) == radar.decoder.counters.cycles > 35
     spacing_s = np.diff([forecast.timestamp_s for forecast in said.forecasts])
@@ -142,7 +148,7 @@ def test_a_busy_service_does_not_take_a_full_queue_for_silence(radar: Pipeline) 
 
 def test_silence_is_said_when_the_radar_has_stopped_and_not_before(radar: Pipeline) -> None:
     said, queue = Said(), Queue(1.5, then_s=0.7)
-    Service(radar, queue, [said], print).run(queue.is_over)
+    Service(radar, queue, [said]).run(queue.is_over)
     modes = [forecast.mode for forecast in said.forecasts]
     first_silent = modes.index(Mode.SILENT)
     assert first_silent == radar.decoder.counters.cycles > 15
@@ -154,7 +160,7 @@ def test_silence_is_said_when_the_radar_has_stopped_and_not_before(radar: Pipeli
 def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> None:
     """On the local bus, on which the recorded radar is played."""
     channel = next(CHANNELS)
-    reports: list[str] = []
+    statuses: list[ServiceStatus] = []
     lines = first_seconds(DRIVES["ars408"].log, 2.3).splitlines()
     with open_bus(channel, LOCAL) as car, open_bus(channel, LOCAL) as bus:
         play = Player({OTHERS: car}).play
@@ -162,22 +168,30 @@ def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> 
             target=play, args=(list(map(candump_message, lines)), lambda: False)
         )
         player.start()
-        Service(radar, bus, [Said()], reports.append).run(lambda: not player.is_alive())
+        Service(radar, bus, [Said()], [statuses.append]).run(lambda: not player.is_alive())
         player.join()
-    assert len(reports) == 2
-    for line in reports:
+    assert len(statuses) == 2
+    for status in statuses:
         assert re.fullmatch(
             r"(NO_MAP|LATE)\s+[12] objects +\d+\.\d predictions/s  latency +\d+\.\d ms "
             r"\(worst +\d+\.\d\) +\d+ messages/s",
-            line,
+            status_line(status),
         )
+    first, last = statuses
+    assert last.time_s - first.time_s == pytest.approx(last.seconds)
+    assert last.uptime_s - first.uptime_s == pytest.approx(last.seconds)
+    assert (first.profile, first.model, first.tile) == ("ars408", "eqrt-free", "")
+    assert first.totals["decoder_messages"] == first.messages
+    assert last.totals["decoder_messages"] == first.messages + last.messages
+    assert last.totals["said"] == last.totals["pipeline_cycles"] > first.totals["said"] > 0
+    assert set(first.stages_s) == {"tracks", "scene", "infer", "guard"}
 
 
 def test_a_bus_that_goes_away_ends_the_service_with_an_explanation(radar: Pipeline) -> None:
     bus = open_bus(next(CHANNELS), LOCAL)
     bus.shutdown()
     with pytest.raises(BusError, match=r"can no longer be read .*start again"):
-        Service(radar, bus, [], print).run(lambda: False)
+        Service(radar, bus, []).run(lambda: False)
 
 
 # --- several buses as one
@@ -204,7 +218,7 @@ def test_a_bus_that_fails_is_not_taken_for_a_silent_one(radar: Pipeline) -> None
     with Merged(buses) as merged:
         buses[names[1]].shutdown()
         with pytest.raises(BusError, match="can no longer be read"):
-            Service(radar, merged, [], print).run(lambda: False)
+            Service(radar, merged, []).run(lambda: False)
     close(buses.values())
 
 
@@ -238,19 +252,56 @@ def close(buses: Iterable[can.BusABC]) -> None:
 # --- what is said
 
 
-def test_the_report_of_a_second_is_one_line() -> None:
-    report = Report(messages=900, latencies_s=[0.010, 0.012, 0.030], newest=many(32))
-    assert report.line(1.0) == (
+def book(pipeline: Pipeline, forecasts: Iterable[ForecastSet]) -> StatusBook:
+    """Of a service that has said these, each 12 ms after its last message came."""
+    found = StatusBook(pipeline, [])
+    for forecast in forecasts:
+        found.published(forecast, time.monotonic() - 0.012)
+        pipeline.counters.cycles += 1
+    return found
+
+
+def test_the_status_is_one_line(radar: Pipeline) -> None:
+    pages = book(radar, [many(32)] * 3)
+    for _ in range(900):
+        pages.received()
+    status = msgspec.structs.replace(pages.close(time.monotonic()), seconds=1.0)
+    latencies_s = [0.010, 0.012, 0.030]
+    status = msgspec.structs.replace(status, latencies_s=latencies_s)
+    assert status_line(status) == (
         "RUN       32 objects   3.0 predictions/s  latency  12.0 ms (worst  30.0)    900 messages/s"
     )
-    assert "  1.5 predictions/s" in report.line(2.0)
-    assert "    450 messages/s" in report.line(2.0)
+    slower = status_line(msgspec.structs.replace(status, seconds=2.0))
+    assert "  1.5 predictions/s" in slower
+    assert "    450 messages/s" in slower
 
 
-def test_the_report_says_what_is_missing() -> None:
-    assert Report(messages=120).line(1.0) == "no object cycle (120 messages/s)"
-    assert Report().line(1.0) == "no object cycle (0 messages/s)"
-    silent = Report(newest=nobody()).line(1.0)
+def test_latency_counts_from_the_arrival_of_the_last_message(radar: Pipeline) -> None:
+    (latency_s,) = book(radar, [one_car()]).close(time.monotonic()).latencies_s
+    assert 0.012 <= latency_s < 1.0
+
+
+def test_the_status_says_since_when_the_mode_holds(radar: Pipeline) -> None:
+    """And before the first cycle, that nothing has been said yet."""
+    pages = book(radar, [])
+    begun_s = time.monotonic()
+    status = pages.close(begun_s + 5.0)
+    assert (status.mode, status.objects) == (Mode.SILENT, 0)
+    assert status.mode_s == pytest.approx(5.0, abs=0.5)
+    pages.published(one_car(), begun_s)
+    status = pages.close(begun_s + 7.0)
+    assert (status.mode, status.objects) == (Mode.NO_MAP, 1)
+    assert status.mode_s == pytest.approx(7.0, abs=0.5)
+    pages.published(one_car(), begun_s)
+    assert pages.close(begun_s + 9.0).mode_s == pytest.approx(9.0, abs=0.5)
+
+
+def test_the_status_line_says_what_is_missing(radar: Pipeline) -> None:
+    pages = book(radar, [])
+    for _ in range(120):
+        pages.received()
+    status = msgspec.structs.replace(pages.close(time.monotonic()), seconds=1.0)
+    assert status_line(status) == "no object cycle (120 messages/s)"
+    silent = status_line(book(radar, [nobody()]).close(time.monotonic() + 1.0))
     assert silent.startswith("SILENT     0 objects   0.0 predictions/s")
     assert "latency" not in silent
-    assert Report(newest=one_car()).line(1.0).startswith("NO_MAP     1 objects")

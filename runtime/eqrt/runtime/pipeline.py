@@ -94,9 +94,9 @@ class Pipeline:
         self.tracks = TrackStore()
         self.counters = PipelineCounters()
         self.times = StageTimes()
-        self._profile = profile
-        self._predictor = predictor
-        self._tile = tile
+        self.profile = profile
+        self.predictor = predictor
+        self.tile = tile
         self._lanes = centerline_source(tile.lane_map, predictor.contract) if tile else None
         self._clock = clock
         self._nobody = _nobody(predictor.contract)
@@ -118,7 +118,7 @@ class Pipeline:
         self._controlled_s = now_s
         made = self._handle_all(self.decoder.poll(now_s), now_s)
         if now_s >= self._silent_due_s and not made:
-            dt_s = self._predictor.contract.dt_s
+            dt_s = self.predictor.contract.dt_s
             self._silent_due_s = now_s + dt_s - (now_s - self._silent_due_s) % dt_s
             made.append(self._silence(now_s))
         return made
@@ -143,10 +143,10 @@ class Pipeline:
         started_s = self._time(now_s)
         timestamp_s = detections.timestamp_s
         ego = self.ego.at(timestamp_s)
-        self.tracks.update(detections, ego, self._profile.sensor(detections.sensor).mount)
-        self._silent_due_s = now_s + SILENT_PERIODS * self._predictor.contract.dt_s
+        self.tracks.update(detections, ego, self.profile.sensor(detections.sensor).mount)
+        self._silent_due_s = now_s + SILENT_PERIODS * self.predictor.contract.dt_s
         since_s = timestamp_s - self._predicted_s
-        if -_MAX_CLOCK_STEP_S <= since_s < MIN_PERIOD * self._predictor.contract.dt_s:
+        if -_MAX_CLOCK_STEP_S <= since_s < MIN_PERIOD * self.predictor.contract.dt_s:
             self.counters.skipped += 1
             return None
         self._predicted_s = timestamp_s
@@ -161,14 +161,14 @@ class Pipeline:
         begun_s = self._time(moment.now_s)
         scene, targets = self._targets(tracks, alive, ego)
         scene_s = self._time(moment.now_s)
-        prediction = self._predictor.predict(scene)
+        prediction = self.predictor.predict(scene)
         infer_s = self._time(moment.now_s)
         guarded = guard(
             prediction.trajectories,
             prediction.probabilities.astype(np.float64),
             targets.history,
             targets.valid,
-            self._predictor.contract.dt_s,
+            self.predictor.contract.dt_s,
         )
         self.times.scene_s, self.times.infer_s = scene_s - begun_s, infer_s - scene_s
         self.times.guard_s = self._time(moment.now_s) - infer_s
@@ -193,11 +193,11 @@ class Pipeline:
         self, agents: AgentHistories, targets: NDArray[np.intp], ego: EgoState, origin: Float64
     ) -> Scene:
         lanes = self._lanes if ego.has_map_pose else None
-        return build_scene(agents, targets, self._predictor.contract, lanes, origin)
+        return build_scene(agents, targets, self.predictor.contract, lanes, origin)
 
     def _agents(self, tracks: Tracks, anchor_s: float) -> AgentHistories:
         """All tracks, and the ego vehicle after them, on the clock that ends at `anchor_s`."""
-        contract = self._predictor.contract
+        contract = self.predictor.contract
         steps, dt_s = contract.history_steps, contract.dt_s
         positions, valid = self.tracks.history(anchor_s, steps, dt_s, tracks.row)
         facing = np.stack([np.cos(tracks.heading_rad), np.sin(tracks.heading_rad)], axis=-1)
@@ -225,16 +225,23 @@ class Pipeline:
             made_s=made_s,
             compute_s=compute_s,
             mode=self._mode(ego, guarded, compute_s),
-            model_id=self._predictor.model_id,
-            tile_id=self._tile.info.tile_id if self._tile else "",
+            model_id=self.predictor.model_id,
+            tile_id=self.tile.info.tile_id if self.tile else "",
             map_from_ego=ego.map_from_ego if ego else Pose2(),
-            dt_s=self._predictor.contract.dt_s,
+            ego_speed_mps=ego.velocity[0] if ego else np.nan,
+            dt_s=self.predictor.contract.dt_s,
             track_id=targets.track_id,
             object_id=targets.object_id,
             anchor_s=targets.anchor_s,
             agent_mode=np.where(guarded.accepted, seen, Mode.FALLBACK).astype(np.uint8),
             position=targets.history[:, -1],
             velocity=guarded.velocity,
+            heading_rad=targets.heading_rad,
+            object_class=targets.object_class,
+            length_m=targets.length_m,
+            width_m=targets.width_m,
+            history=targets.history,
+            history_valid=targets.valid,
             trajectories=guarded.trajectories,
             probabilities=guarded.probabilities,
         )
@@ -242,11 +249,11 @@ class Pipeline:
     def _mode(self, ego: EgoState | None, guarded: Guarded, compute_s: float) -> Mode:
         if len(guarded.accepted) and not guarded.accepted.any():
             return Mode.FALLBACK
-        if ego is None or (self._tile is not None and not ego.has_map_pose):
+        if ego is None or (self.tile is not None and not ego.has_map_pose):
             return Mode.NO_POSE
-        if compute_s > self._predictor.contract.dt_s:
+        if compute_s > self.predictor.contract.dt_s:
             return Mode.LATE
-        return Mode.RUN if self._tile else Mode.NO_MAP
+        return Mode.RUN if self.tile else Mode.NO_MAP
 
     def _silence(self, now_s: float) -> ForecastSet:
         said = self._forecast(*self._nobody, None, _Moment(self._predicted_s, now_s, now_s))
@@ -275,6 +282,10 @@ class _Targets:
     track_id: NDArray[np.int64]
     object_id: NDArray[np.int64]
     anchor_s: Float64
+    heading_rad: Float64
+    object_class: NDArray[np.uint8]
+    length_m: Float64
+    width_m: Float64
     history: Float64
     """(B, T, 2) map frame; the last step is a measurement."""
     valid: Bool
@@ -287,6 +298,10 @@ class _Targets:
             track_id=tracks.track_id[rows],
             object_id=tracks.object_id[rows],
             anchor_s=tracks.timestamp_s[rows],
+            heading_rad=tracks.heading_rad[rows],
+            object_class=tracks.object_class[rows],
+            length_m=tracks.length_m[rows],
+            width_m=tracks.width_m[rows],
             history=agents.positions[rows],
             valid=agents.valid[rows],
         )
@@ -304,6 +319,10 @@ def _nobody(contract: ModelContract) -> tuple[_Targets, Guarded]:
         track_id=np.zeros(0, np.int64),
         object_id=np.zeros(0, np.int64),
         anchor_s=np.zeros(0),
+        heading_rad=np.zeros(0),
+        object_class=np.zeros(0, np.uint8),
+        length_m=np.zeros(0),
+        width_m=np.zeros(0),
         history=np.zeros((0, contract.history_steps, 2)),
         valid=np.zeros((0, contract.history_steps), np.bool_),
     )

@@ -7,7 +7,7 @@ import contextlib
 import gc
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, Queue
 
@@ -19,11 +19,13 @@ from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.decoding.profile import Profile, builtin_profiles, load_profile
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS, DatagramPublisher
 from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher
+from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.prediction.tiles import load_tile
-from eqrt.runtime.service import Publisher, Receiver, Service
+from eqrt.runtime.service import Observer, Publisher, Receiver, Service
 from eqrt.runtime.signals import until_told_to_stop
+from eqrt.runtime.status_book import status_line
 
 NO_CHANNEL = "none"
 _NOTICE_END_S = 0.1  # how often a thread of python-can looks whether it is to end
@@ -151,9 +153,9 @@ def run(args: argparse.Namespace) -> int:
         several = channels if len(buses) > 1 else None
         pipeline = load_pipeline(args, profile, several, clock=time.monotonic)
         publishers = _publishers(args, buses, stack)
-        receiver = _receiver(buses, stack)
-        report = _say_nothing if args.quiet else _say
-        service = Service(pipeline, receiver, publishers, report)
+        service = Service(
+            pipeline, _receiver(buses, stack), publishers, _observers(args, publishers)
+        )
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
         print(f"eqrt serve: {profile.name} on {', '.join(buses)}; Ctrl-C ends", flush=True)
         service.run(should_stop)
@@ -245,12 +247,14 @@ def _publishers(
     return publishers
 
 
-def _say(line: str) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)
+def _observers(args: argparse.Namespace, publishers: Sequence[Publisher]) -> list[Observer]:
+    observers: list[Observer] = [] if args.quiet else [_say]
+    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
+    return observers
 
 
-def _say_nothing(_line: str) -> None:
-    pass
+def _say(status: ServiceStatus) -> None:
+    print(f"{time.strftime('%H:%M:%S')} {status_line(status)}", flush=True)
 
 
 def _summary(pipeline: Pipeline) -> str:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import can
-import numpy as np
 
 from eqrt.core.errors import BusError
 from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.status_book import StatusBook
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly
 _REPORT_S = 1.0
@@ -40,26 +40,12 @@ class Publisher(Protocol):
     def publish(self, forecast: ForecastSet) -> None:
         """Send one cycle's predictions; never raises on a full or closed destination."""
 
+    def counts(self) -> dict[str, int]:
+        """Since the start, by name."""
 
-@dataclass(slots=True)
-class Report:
-    """What happened since the last report."""
 
-    messages: int = 0
-    latencies_s: list[float] = field(default_factory=list)
-    """From the arrival of a cycle's last message to its predictions having been sent."""
-    newest: ForecastSet | None = None
-
-    def line(self, seconds: float) -> str:
-        """One line for the terminal."""
-        if self.newest is None:
-            return f"no object cycle ({self.messages / seconds:.0f} messages/s)"
-        mode, count = self.newest.mode.name, self.newest.num_targets
-        text = f"{mode:<8} {count:3d} objects {len(self.latencies_s) / seconds:5.1f} predictions/s"
-        if self.latencies_s:
-            middle, worst = 1e3 * np.median(self.latencies_s), 1e3 * max(self.latencies_s)
-            text += f"  latency {middle:5.1f} ms (worst {worst:5.1f})"
-        return f"{text}  {self.messages / seconds:5.0f} messages/s"
+Observer = Callable[[ServiceStatus], None]
+"""Hears once a second how the service is."""
 
 
 class Service:
@@ -69,17 +55,17 @@ class Service:
         self,
         pipeline: Pipeline,
         receiver: Receiver,
-        publishers: list[Publisher],
-        report: Callable[[str], None],
+        publishers: Sequence[Publisher],
+        observers: Sequence[Observer] = (),
         clock: Clock | None = None,
     ) -> None:
         """`clock`: None = when messages arrive."""
         self._pipeline = pipeline
         self._receiver = receiver
         self._publishers = publishers
-        self._report = report
+        self._observers = observers
         self._clock = clock or ArrivalClock()
-        self._second = Report()
+        self._book = StatusBook(pipeline, publishers)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Serve until told to stop. Raises BusError if the bus goes away."""
@@ -90,10 +76,10 @@ class Service:
             now_s = self._clock.now_s(time.monotonic(), stamp_s, time.time())
             self._publish(self._pipeline.poll(now_s), now_s)
             if message is not None:
-                self._second.messages += 1
+                self._book.received()
                 self._publish(self._pipeline.feed(message, now_s), now_s)
             if (monotonic_s := time.monotonic()) >= report_due_s:
-                report_due_s = self._say(monotonic_s, report_due_s)
+                report_due_s = self._report(monotonic_s, report_due_s)
 
     def _receive(self) -> can.Message | None:
         try:
@@ -107,14 +93,13 @@ class Service:
         for forecast in forecasts:
             for publisher in self._publishers:
                 publisher.publish(forecast)
-            self._second.newest = forecast
-            if forecast.num_targets:
-                self._second.latencies_s.append(time.monotonic() - arrived_s)
+            self._book.published(forecast, arrived_s)
 
-    def _say(self, now_s: float, due_s: float) -> float:
-        """Report the second that has passed; returns when the next one ends."""
-        self._report(self._second.line(_REPORT_S + now_s - due_s))
-        self._second = Report()
+    def _report(self, now_s: float, due_s: float) -> float:
+        """Say how the second was that has passed; returns when the next one ends."""
+        status = self._book.close(now_s)
+        for observe in self._observers:
+            observe(status)
         return max(due_s + _REPORT_S, now_s)
 
 

@@ -29,7 +29,7 @@ from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.demo.picture import render
 from eqrt.runtime.demo.score import Scoreboard
 from eqrt.runtime.demo.snapshots import BestMoment
-from eqrt.runtime.output.datagrams import decode_datagram
+from eqrt.runtime.output.datagrams import Datagram, decode_datagram
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.prediction.tiles import load_tile
 
@@ -203,7 +203,10 @@ def _forecasts(
         if player.poll() is not None:
             end_s = min(end_s, time.monotonic() + _SILENT_S)
         with contextlib.suppress(TimeoutError):
-            forecast = decode_datagram(receiver.recv(65_535)).forecasts
+            heard = decode_datagram(receiver.recv(65_535))
+            if not isinstance(heard, Datagram):
+                continue
+            forecast = heard.forecasts
             if seconds is not None and forecast.num_targets:
                 end_s = min(end_s, time.monotonic() + seconds)
             yield forecast

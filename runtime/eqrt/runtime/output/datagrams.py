@@ -1,8 +1,9 @@
-"""Forecasts as UDP datagrams, for viewers and recorders on the same machine.
+"""Forecasts and the service's status as UDP datagrams, for viewers and recorders on this machine.
 
-A datagram is one msgpack map (see `_Wire` and docs/output.md) with its arrays as little-endian
-bytes. A cycle that is too large for one is sent in parts, each a complete record of some of its
-objects. Nobody has to listen: sending to a closed port costs the same and fails nothing.
+A datagram is one msgpack map (docs/output.md): of kind `forecast` (`_Wire`), with its arrays as
+little-endian bytes, or of kind `status` (`ServiceStatus`). A cycle that is too large for one is
+sent in parts, each a complete record of some of its objects. Nobody has to listen: sending to a
+closed port costs the same and fails nothing.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from numpy.typing import NDArray
 from eqrt.core.errors import UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.status import ServiceStatus
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 DEFAULT_ADDRESS = "127.0.0.1:47310"
 MAX_BYTES = 60_000
 """A datagram's size at most; UDP allows 65,507."""
-_HEADER_BYTES, _OBJECT_BYTES = 1_000, 41  # more than the map's keys take; per object, less its K, H
+_HEADER_BYTES, _OBJECT_BYTES = 1_200, 66  # more than the map's keys take; per object, less T, K, H
 _SEND_BYTES = 1 << 20
 
 
@@ -57,13 +59,24 @@ class DatagramPublisher:
         if not self._addresses:
             return
         for payload in encode_datagrams(forecasts):
-            for family, address in self._addresses:
-                try:
-                    self._sockets[family].sendto(payload, address)
-                except OSError:
-                    self.failed += 1
-                else:
-                    self.sent += 1
+            self._send(payload)
+
+    def report(self, status: ServiceStatus) -> None:
+        """Send the service's own state."""
+        self._send(_ENCODER.encode(_StatusWire(version=FORMAT_VERSION, status=status)))
+
+    def counts(self) -> dict[str, int]:
+        """Since the start, by name."""
+        return {"datagrams_sent": self.sent, "datagrams_failed": self.failed}
+
+    def _send(self, payload: bytes) -> None:
+        for family, address in self._addresses:
+            try:
+                self._sockets[family].sendto(payload, address)
+            except OSError:
+                self.failed += 1
+            else:
+                self.sent += 1
 
     def close(self) -> None:
         """Give the sockets back; leaving a `with` block does it too."""
@@ -80,23 +93,30 @@ class DatagramPublisher:
 def encode_datagrams(forecasts: ForecastSet) -> Iterator[bytes]:
     """The datagrams of one cycle, each of at most MAX_BYTES; one also if there are no targets."""
     _, num_modes, horizon, _ = forecasts.trajectories.shape
-    object_bytes = _OBJECT_BYTES + 4 * num_modes * (2 * horizon + 1)
+    floats = 2 * forecasts.history.shape[1] + num_modes * (2 * horizon + 1)
+    if forecasts.covariances is not None:
+        floats += 4 * num_modes * horizon
+    object_bytes = _OBJECT_BYTES + forecasts.history.shape[1] + 4 * floats
     rows = max(1, (MAX_BYTES - _HEADER_BYTES) // object_bytes)
     parts = max(1, -(-forecasts.num_targets // rows))
     for part in range(parts):
         yield _ENCODER.encode(_wire(forecasts, slice(part * rows, (part + 1) * rows), part, parts))
 
 
-def decode_datagram(payload: bytes) -> Datagram:
+def decode_datagram(payload: bytes) -> Datagram | ServiceStatus:
     """The record in a datagram; ValueError if it is none of ours or of another version."""
     try:
         version = msgspec.msgpack.decode(payload, type=_Version).version
         if version != FORMAT_VERSION:
-            raise ValueError(f"datagram format {version}, this version of eqrt reads format 1")
+            raise ValueError(
+                f"datagram format {version}, this version of eqrt reads format {FORMAT_VERSION}"
+            )
         wire = _DECODER.decode(payload)
-        return Datagram(wire.part, wire.parts, _forecasts(wire))
     except msgspec.MsgspecError as error:
         raise ValueError(f"not a datagram of eqrt ({error})") from error
+    if isinstance(wire, _StatusWire):
+        return wire.status
+    return Datagram(wire.part, wire.parts, _forecasts(wire))
 
 
 class _Version(msgspec.Struct):
@@ -105,8 +125,17 @@ class _Version(msgspec.Struct):
     version: int
 
 
-class _Wire(msgspec.Struct):
-    """The map that travels: keys as here; A objects, K modes, H steps, all arrays row by row."""
+class _StatusWire(msgspec.Struct, tag_field="kind", tag="status"):
+    """The map that travels with a status."""
+
+    version: int
+    status: ServiceStatus
+
+
+class _Wire(msgspec.Struct, tag_field="kind", tag="forecast"):
+    """The map that travels with a cycle: keys as here; A objects, T steps of history, K modes, H
+    steps to come, all arrays row by row.
+    """
 
     version: int
     part: int
@@ -119,56 +148,77 @@ class _Wire(msgspec.Struct):
     model_id: str
     tile_id: str
     map_from_ego: tuple[float, float, float]  # x m, y m, yaw rad
-    origin: tuple[float, float]  # m, map frame: `position` and `trajectories` count from here
+    origin: tuple[float, float]  # m, map frame: positions count from here
+    ego_speed_mps: float
     dt_s: float
-    shape: tuple[int, int, int]  # A, K, H
+    shape: tuple[int, int, int, int]  # A, T, K, H
     track_id: bytes  # int64 (A,)
     object_id: bytes  # int64 (A,)
     anchor_s: bytes  # float64 (A,)
     agent_mode: bytes  # uint8 (A,)
     position: bytes  # float32 (A, 2)
     velocity: bytes  # float32 (A, 2)
+    heading_rad: bytes  # float32 (A,)
+    object_class: bytes  # uint8 (A,)
+    length_m: bytes  # float32 (A,)
+    width_m: bytes  # float32 (A,)
+    history: bytes  # float32 (A, T, 2)
+    history_valid: bytes  # uint8 (A, T), 0 or 1
     trajectories: bytes  # float32 (A, K, H, 2)
     probabilities: bytes  # float32 (A, K)
+    covariances: bytes  # float32 (A, K, H, 2, 2), or empty
 
 
 _ENCODER = msgspec.msgpack.Encoder()
-_DECODER = msgspec.msgpack.Decoder(_Wire)
+_DECODER = msgspec.msgpack.Decoder(_Wire | _StatusWire)
 
 
 def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
     pose = forecasts.map_from_ego
     origin = (pose.x_m, pose.y_m)  # float32 is exact to 0.1 mm around the ego vehicle
-    track_id = forecasts.track_id[rows]
+    some = forecasts.targets(rows)
     return _Wire(
         version=FORMAT_VERSION,
         part=part,
         parts=parts,
-        cycle=forecasts.cycle,
-        timestamp_s=forecasts.timestamp_s,
-        made_s=forecasts.made_s,
-        compute_s=forecasts.compute_s,
-        mode=int(forecasts.mode),
-        model_id=forecasts.model_id,
-        tile_id=forecasts.tile_id,
+        cycle=some.cycle,
+        timestamp_s=some.timestamp_s,
+        made_s=some.made_s,
+        compute_s=some.compute_s,
+        mode=int(some.mode),
+        model_id=some.model_id,
+        tile_id=some.tile_id,
         map_from_ego=(pose.x_m, pose.y_m, pose.yaw_rad),
         origin=origin,
-        dt_s=forecasts.dt_s,
-        shape=(len(track_id), *forecasts.trajectories.shape[1:3]),
-        track_id=track_id.astype("<i8").tobytes(),
-        object_id=forecasts.object_id[rows].astype("<i8").tobytes(),
-        anchor_s=forecasts.anchor_s[rows].astype("<f8").tobytes(),
-        agent_mode=forecasts.agent_mode[rows].tobytes(),
-        position=(forecasts.position[rows] - origin).astype("<f4").tobytes(),
-        velocity=forecasts.velocity[rows].astype("<f4").tobytes(),
-        trajectories=(forecasts.trajectories[rows] - origin).astype("<f4").tobytes(),
-        probabilities=forecasts.probabilities[rows].astype("<f4").tobytes(),
+        ego_speed_mps=some.ego_speed_mps,
+        dt_s=some.dt_s,
+        shape=(some.num_targets, some.history.shape[1], *some.trajectories.shape[1:3]),
+        track_id=some.track_id.astype("<i8").tobytes(),
+        object_id=some.object_id.astype("<i8").tobytes(),
+        anchor_s=some.anchor_s.astype("<f8").tobytes(),
+        agent_mode=some.agent_mode.tobytes(),
+        position=_bytes(some.position - origin),
+        velocity=_bytes(some.velocity),
+        heading_rad=_bytes(some.heading_rad),
+        object_class=some.object_class.tobytes(),
+        length_m=_bytes(some.length_m),
+        width_m=_bytes(some.width_m),
+        history=_bytes(some.history - origin),
+        history_valid=some.history_valid.tobytes(),
+        trajectories=_bytes(some.trajectories - origin),
+        probabilities=_bytes(some.probabilities),
+        covariances=b"" if some.covariances is None else _bytes(some.covariances),
     )
 
 
 def _forecasts(wire: _Wire) -> ForecastSet:
     """Raises ValueError if the arrays have not the shape that the map says, or the mode is new."""
-    agents, num_modes, horizon = wire.shape
+    agents, steps, num_modes, horizon = wire.shape
+    if min(wire.shape) < 0:
+        raise ValueError(f"not a datagram of eqrt (shape {wire.shape})")
+    covariances = None
+    if wire.covariances:
+        covariances = _array(wire.covariances, agents, num_modes, horizon, 2, 2)
     return ForecastSet(
         cycle=wire.cycle,
         timestamp_s=wire.timestamp_s,
@@ -178,6 +228,7 @@ def _forecasts(wire: _Wire) -> ForecastSet:
         model_id=wire.model_id,
         tile_id=wire.tile_id,
         map_from_ego=Pose2(*wire.map_from_ego),
+        ego_speed_mps=wire.ego_speed_mps,
         dt_s=wire.dt_s,
         track_id=np.frombuffer(wire.track_id, "<i8").reshape(agents),
         object_id=np.frombuffer(wire.object_id, "<i8").reshape(agents),
@@ -185,9 +236,20 @@ def _forecasts(wire: _Wire) -> ForecastSet:
         agent_mode=np.frombuffer(wire.agent_mode, np.uint8).reshape(agents),
         position=_array(wire.position, agents, 2) + wire.origin,
         velocity=_array(wire.velocity, agents, 2),
+        heading_rad=_array(wire.heading_rad, agents),
+        object_class=np.frombuffer(wire.object_class, np.uint8).reshape(agents),
+        length_m=_array(wire.length_m, agents),
+        width_m=_array(wire.width_m, agents),
+        history=_array(wire.history, agents, steps, 2) + wire.origin,
+        history_valid=np.frombuffer(wire.history_valid, np.uint8).reshape(agents, steps) != 0,
         trajectories=_array(wire.trajectories, agents, num_modes, horizon, 2) + wire.origin,
         probabilities=_array(wire.probabilities, agents, num_modes),
+        covariances=covariances,
     )
+
+
+def _bytes(values: NDArray[np.float64]) -> bytes:
+    return values.astype("<f4").tobytes()
 
 
 def _array(values: bytes, *shape: int) -> NDArray[np.float64]:

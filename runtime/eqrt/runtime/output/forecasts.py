@@ -1,12 +1,13 @@
 """What the service says: the predictions of one cycle, with how they came about.
 
 Publishers and recorders get this record and nothing else. Arrays share their first axis A (the
-targets of the cycle); K modes, most probable first; H steps of `dt_s`. Map frame, metres, seconds.
+targets of the cycle); T steps of history; K modes, most probable first; H steps of `dt_s` to come.
+Map frame, metres, seconds.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -56,6 +57,8 @@ class ForecastSet:
     tile_id: str
     """Likewise of the tile; empty without a map."""
     map_from_ego: Pose2
+    ego_speed_mps: float
+    """Of the ego reference point over ground, backwards negative; NaN = not known."""
     dt_s: float
     """Between steps: step h of a target is at `anchor_s + (h + 1) * dt_s`."""
     track_id: NDArray[np.int64]
@@ -70,10 +73,24 @@ class ForecastSet:
     """(A, 2) at `anchor_s`."""
     velocity: NDArray[np.float64]
     """(A, 2) m/s over ground at `anchor_s`, NaN = not known."""
+    heading_rad: NDArray[np.float64]
+    """(A,) as the sensor says, counter-clockwise from east, NaN = it does not."""
+    object_class: NDArray[np.uint8]
+    """(A,) `ObjectClass`."""
+    length_m: NDArray[np.float64]
+    """(A,) NaN = not known."""
+    width_m: NDArray[np.float64]
+    """(A,) NaN = not known."""
+    history: NDArray[np.float64]
+    """(A, T, 2) what the model was given: steps of `dt_s` up to `anchor_s`."""
+    history_valid: NDArray[np.bool_]
+    """(A, T) False = not seen; what `history` holds there means nothing."""
     trajectories: NDArray[np.float64]
     """(A, K, H, 2)"""
     probabilities: NDArray[np.float64]
     """(A, K) sum to 1."""
+    covariances: NDArray[np.float64] | None = None
+    """(A, K, H, 2, 2) square metres; None from a model that predicts none."""
 
     @property
     def num_targets(self) -> int:
@@ -84,3 +101,27 @@ class ForecastSet:
     def age_s(self) -> NDArray[np.float64]:
         """(A,) how old each target's last measurement was when the prediction was finished."""
         return self.made_s - self.anchor_s
+
+    def targets(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> ForecastSet:
+        """The same cycle with only some of its targets."""
+        chosen = {name: getattr(self, name)[rows] for name in _OF_TARGETS}
+        covariances = None if self.covariances is None else self.covariances[rows]
+        return replace(self, covariances=covariances, **chosen)
+
+
+_OF_TARGETS = (
+    "track_id",
+    "object_id",
+    "anchor_s",
+    "agent_mode",
+    "position",
+    "velocity",
+    "heading_rad",
+    "object_class",
+    "length_m",
+    "width_m",
+    "history",
+    "history_valid",
+    "trajectories",
+    "probabilities",
+)

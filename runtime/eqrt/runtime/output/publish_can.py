@@ -56,6 +56,10 @@ class CanPublisher:
             self._count(offset, rows)
             self._send(self._base_id + offset, rows)
 
+    def counts(self) -> dict[str, int]:
+        """Since the start, by name."""
+        return {"can_sent": self.sent, "can_failed": self.failed}
+
     def _count(self, offset: Offset, rows: Rows) -> None:
         """Number the messages of one id, so that a consumer sees if one was lost."""
         counts = self._alive[offset] + np.arange(len(rows))

@@ -18,6 +18,8 @@ class Tile:
 
     lane_map: LaneMap
     info: TileInfo
+    path: Path
+    """The file that it was read from."""
 
 
 def load_tile(path: Path) -> Tile:
@@ -33,7 +35,7 @@ def load_tile(path: Path) -> Tile:
     except OSError as error:
         raise TileError(f"{path}: the tile cannot be read ({error.strerror})") from error
     lane_map, info = decode(data, str(path))
-    return Tile(lane_map, info)
+    return Tile(lane_map, info, path)
 
 
 def save_tile(path: Path, data: bytes) -> None:

@@ -108,3 +108,7 @@ class NotingPublisher:
         begun_ns = CLOCK()
         self._publisher.publish(forecast)
         self._journal.published(forecast, begun_ns)
+
+    def counts(self) -> dict[str, int]:
+        """As the publisher's own."""
+        return self._publisher.counts()

@@ -92,7 +92,6 @@ class _Run:
             self._pipeline,
             NotingReceiver(bus, journal),
             [NotingPublisher(CanPublisher(bus), journal)],
-            report=lambda _line: None,
             clock=AnsweredClock(journal, dt_s) if self._order.answered_clock else ArrivalClock(),
         )
         gc.collect()
