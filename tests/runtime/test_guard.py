@@ -1,57 +1,105 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from eqrt.runtime.prediction.guard import guard
+from eqrt.core.kinematics import constant_turn
+from eqrt.runtime.decoding.detections import ObjectClass
+from eqrt.runtime.prediction.forecaster import Raw
+from eqrt.runtime.prediction.guard import LIMITS, MAX_GAIN_MPS, START_M, Guarded, guard
+from eqrt.runtime.prediction.targets import Targets
 
 DT_S = 0.1
 STEPS = 30
+AHEAD_S = DT_S * np.arange(1, STEPS + 1)
+
+Float64 = NDArray[np.float64]
 
 
-def driving(speed_mps: float = 12.0) -> tuple[np.ndarray, np.ndarray]:
-    """History (1, 20, 2) along +x that ends at (0, 0), all valid."""
-    time = (np.arange(20) - 19) * DT_S
-    history = np.stack([speed_mps * time, np.zeros(20)], axis=-1)[None]
-    return history, np.ones((1, 20), np.bool_)
+def driving(
+    speed_mps: float = 12.0, kind: int = ObjectClass.CAR, targets: int = 1, modes: int = 2
+) -> Raw:
+    """Targets that drive along +x and are at (0, 0) now; every mode goes on like that."""
+    history = np.stack([speed_mps * DT_S * np.arange(-19, 1), np.zeros(20)], axis=-1)
+    ahead = np.stack([speed_mps * AHEAD_S, np.zeros(STEPS)], axis=-1)
+    unknown = np.full(targets, np.nan)
+    return Raw(
+        targets=Targets(
+            track_id=np.arange(targets),
+            object_id=np.arange(targets),
+            anchor_s=np.zeros(targets),
+            heading_rad=unknown,
+            object_class=np.full(targets, kind, np.uint8),
+            length_m=unknown,
+            width_m=unknown,
+            history=np.tile(history, (targets, 1, 1)),
+            valid=np.ones((targets, 20), np.bool_),
+        ),
+        trajectories=np.tile(ahead, (targets, modes, 1, 1)),
+        probabilities=np.full((targets, modes), 1.0 / modes),
+        covariances=None,
+        late=np.zeros(targets, np.bool_),
+    )
 
 
-def straight_on(speed_mps: float = 12.0, modes: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    time = np.arange(1, STEPS + 1) * DT_S
-    path = np.stack([speed_mps * time, np.zeros(STEPS)], axis=-1)
-    return np.tile(path, (1, modes, 1, 1)), np.full((1, modes), 1 / modes)
+def guarded(raw: Raw) -> Guarded:
+    targets = raw.targets
+    return guard(
+        raw.trajectories,
+        raw.probabilities,
+        targets.history,
+        targets.valid,
+        DT_S,
+        object_class=targets.object_class,
+        covariances=raw.covariances,
+    )
+
+
+def uncertain(raw: Raw) -> Raw:
+    return replace(raw, covariances=np.tile(np.eye(2), (*raw.trajectories.shape[:3], 1, 1)))
 
 
 def test_a_possible_prediction_passes_untouched() -> None:
-    trajectories, probabilities = straight_on()
-    result = guard(trajectories, probabilities, *driving(), DT_S)
+    raw = uncertain(driving())
+    result = guarded(raw)
     assert result.accepted.all()
-    assert result.trajectories is trajectories
+    assert result.trajectories is raw.trajectories
+    assert result.probabilities is raw.probabilities
+    assert result.covariances is raw.covariances
     np.testing.assert_allclose(result.velocity, [[12.0, 0.0]])
 
 
-def nan_in_a_late_mode(t: np.ndarray, _p: np.ndarray) -> None:
-    t[0, 1, 20] = np.nan
+def nan_in_a_late_mode(raw: Raw) -> None:
+    raw.trajectories[0, 1, 20] = np.nan
 
 
-def jump_at_the_start(t: np.ndarray, _p: np.ndarray) -> None:
-    t[0, 0] += 5.0
+def jump_at_the_start(raw: Raw) -> None:
+    raw.trajectories[0, 0] += 5.0
 
 
-def teleport(t: np.ndarray, _p: np.ndarray) -> None:
-    t[0, 0, 15:] += 50.0
+def teleport(raw: Raw) -> None:
+    raw.trajectories[0, 0, 15:] += 50.0
 
 
-def impossible_braking(t: np.ndarray, _p: np.ndarray) -> None:
-    t[0, 0, 2:] = t[0, 0, 2]
+def braking_that_no_tyre_gives(raw: Raw) -> None:
+    raw.trajectories[0, 0, 2:] = raw.trajectories[0, 0, 2]
 
 
-def probabilities_do_not_sum_to_one(_t: np.ndarray, p: np.ndarray) -> None:
-    p *= 1.1
+def probabilities_that_do_not_sum_to_one(raw: Raw) -> None:
+    raw.probabilities *= 1.1
 
 
-def infinite_probability(_t: np.ndarray, p: np.ndarray) -> None:
-    p[0, 0] = np.inf
+def an_infinite_probability(raw: Raw) -> None:
+    raw.probabilities[0, 0] = np.inf
+
+
+def a_covariance_that_is_none(raw: Raw) -> None:
+    assert raw.covariances is not None
+    raw.covariances[0, 1, 7, 0, 1] = np.nan
 
 
 @pytest.mark.parametrize(
@@ -60,44 +108,123 @@ def infinite_probability(_t: np.ndarray, p: np.ndarray) -> None:
         nan_in_a_late_mode,
         jump_at_the_start,
         teleport,
-        impossible_braking,
-        probabilities_do_not_sum_to_one,
-        infinite_probability,
+        braking_that_no_tyre_gives,
+        probabilities_that_do_not_sum_to_one,
+        an_infinite_probability,
+        a_covariance_that_is_none,
     ],
 )
-def test_an_impossible_prediction_falls_back_to_constant_turn(break_it) -> None:  # type: ignore[no-untyped-def]
-    trajectories, probabilities = straight_on(30.0 if break_it is impossible_braking else 12.0)
-    break_it(trajectories, probabilities)
-    history = driving(30.0 if break_it is impossible_braking else 12.0)
-    result = guard(trajectories, probabilities, *history, DT_S)
-    assert not result.accepted.any()
-    expected, _ = straight_on(30.0 if break_it is impossible_braking else 12.0)
-    np.testing.assert_allclose(result.trajectories, expected, atol=1e-9)
-    np.testing.assert_array_equal(result.probabilities, [[1.0, 0.0]])
-
-
-def test_one_broken_target_does_not_touch_the_others() -> None:
-    trajectories, probabilities = straight_on()
-    trajectories = np.concatenate([trajectories, trajectories])
-    trajectories[0, 0, 3] = np.inf
-    history, valid = driving()
-    result = guard(
-        trajectories,
-        np.concatenate([probabilities, probabilities]),
-        np.concatenate([history, history]),
-        np.concatenate([valid, valid]),
-        DT_S,
-    )
+def test_an_impossible_prediction_falls_back_to_constant_turn(
+    break_it: Callable[[Raw], None],
+) -> None:
+    """And not the neighbour's."""
+    raw, expected = uncertain(driving(30.0, targets=2)), driving(30.0, targets=2)
+    if break_it is probabilities_that_do_not_sum_to_one:
+        raw.probabilities[1] /= 1.1
+    break_it(raw)
+    result = guarded(raw)
     np.testing.assert_array_equal(result.accepted, [False, True])
-    assert np.isfinite(result.trajectories).all()
-    np.testing.assert_array_equal(result.trajectories[1], trajectories[1])
+    np.testing.assert_allclose(result.trajectories, expected.trajectories, atol=1e-9)
+    np.testing.assert_array_equal(result.probabilities[0], [1.0, 0.0])
+    np.testing.assert_allclose(result.probabilities[1], [0.5, 0.5])
+    assert result.covariances is not None
+    assert np.isnan(result.covariances[0]).all()
+    assert np.isfinite(result.covariances[1]).all()
+
+
+def test_a_target_the_model_said_nothing_about_goes_on_turning() -> None:
+    """Half a radian per second to the left."""
+    turning = driving()
+    past_s = DT_S * np.arange(-19, 1)
+    radius_m, rate = 24.0, 0.5
+    history = radius_m * np.stack([np.sin(rate * past_s), 1.0 - np.cos(rate * past_s)], axis=-1)
+    targets = replace(turning.targets, history=history[None])
+    silent = replace(turning, targets=targets, trajectories=np.full((1, 2, STEPS, 2), np.nan))
+    found = guarded(silent)
+    assert not found.accepted.any()
+    circle = radius_m * np.stack([np.sin(rate * AHEAD_S), 1.0 - np.cos(rate * AHEAD_S)], axis=-1)
+    straight = constant_turn(np.zeros((1, 2)), found.velocity, np.zeros(1), STEPS, DT_S)[0]
+    off_m = np.linalg.norm(found.trajectories[0, 0, -1] - circle[-1])
+    assert off_m < 0.5 * np.linalg.norm(straight[-1] - circle[-1])
 
 
 def test_a_target_seen_once_falls_back_to_standing() -> None:
-    trajectories, probabilities = straight_on()
-    history, valid = driving()
-    valid[0, :-1] = False
-    history[0, :-1] = np.nan
-    trajectories[:] = np.nan
-    result = guard(trajectories, probabilities, history, valid, DT_S)
-    np.testing.assert_array_equal(result.trajectories, 0.0)
+    raw = driving()
+    raw.targets.valid[0, :-1] = False
+    raw.targets.history[0, :-1] = np.nan
+    raw.trajectories[:] = np.nan
+    np.testing.assert_array_equal(guarded(raw).trajectories, 0.0)
+
+
+# --- what each class can do
+
+
+def accepted(kind: int, speed_mps: float, path: Float64) -> bool:
+    """Whether an object of this class, at this speed, may go on along `path` (H, 2)."""
+    raw = driving(speed_mps, kind, modes=1)
+    raw.trajectories[0, 0] = path
+    return bool(guarded(raw).accepted[0])
+
+
+def speeding_up(speed_mps: float, by_mps2: float, until_mps: float = np.inf) -> Float64:
+    """Straight on, from the first step on faster and faster."""
+    sign = np.sign(by_mps2)
+    speeds = speed_mps + by_mps2 * (AHEAD_S - DT_S)
+    speeds = np.maximum(sign * np.minimum(sign * speeds, sign * until_mps), 0.0)
+    return np.stack([np.cumsum(speeds) * DT_S, np.zeros(STEPS)], axis=-1)
+
+
+def circling(speed_mps: float, across_mps2: float) -> Float64:
+    """At a constant speed on the circle that takes this acceleration."""
+    rate = across_mps2 / speed_mps
+    start, velocity = np.zeros((1, 2)), np.array([[speed_mps, 0.0]])
+    return constant_turn(start, velocity, np.array([rate]), STEPS, DT_S).squeeze(0)
+
+
+@pytest.mark.parametrize("kind", ObjectClass)
+def test_every_class_has_its_top_speed(kind: ObjectClass) -> None:
+    limits = LIMITS[kind]
+    most = limits.speed_mps
+    from_mps = most - MAX_GAIN_MPS - 1.0  # so that the class decides, and not what it drives now
+    assert accepted(kind, from_mps, speeding_up(from_mps, 6.0, most - 0.1))
+    assert not accepted(kind, from_mps, speeding_up(from_mps, 6.0, most + 0.1))
+
+
+def test_an_object_measured_to_be_faster_than_its_class_may_go_on() -> None:
+    """The sensor may have taken a car for a pedestrian; it does not speed up much more, though."""
+    kind, speed_mps = ObjectClass.PEDESTRIAN, 20.0
+    assert accepted(kind, speed_mps, speeding_up(speed_mps, 6.0, 29.9))
+    assert not accepted(kind, speed_mps, speeding_up(speed_mps, 6.0, 30.1))
+
+
+@pytest.mark.parametrize("kind", ObjectClass)
+def test_every_class_has_its_speeding_up_and_braking(kind: ObjectClass) -> None:
+    limit = LIMITS[kind].along_mps2
+    for sign, begin_mps, end_mps in ((1.0, 1.0, 10.9), (-1.0, 9.5, 0.1)):
+        inside = speeding_up(begin_mps, sign * 0.98 * limit, end_mps)
+        outside = speeding_up(begin_mps, sign * 1.02 * limit, end_mps)
+        assert accepted(kind, begin_mps, inside)
+        assert not accepted(kind, begin_mps, outside)
+
+
+@pytest.mark.parametrize("kind", ObjectClass)
+def test_every_class_has_its_turns(kind: ObjectClass) -> None:
+    """At 11 m/s by grip, and at 5 m/s by how tightly it can turn."""
+    limits = LIMITS[kind]
+    for speed_mps in (11.0, 5.0):
+        most = min(limits.across_mps2, limits.curvature_per_m * speed_mps**2)
+        for sign in (1.0, -1.0):
+            assert accepted(kind, speed_mps, circling(speed_mps, sign * 0.9 * most))
+            assert not accepted(kind, speed_mps, circling(speed_mps, sign * 1.4 * most))
+
+
+def test_a_class_that_does_not_exist_is_held_to_the_last_ones_limits() -> None:
+    """Four bits on the bus can say 15."""
+    assert accepted(15, 12.0, speeding_up(12.0, 2.0))
+    assert not accepted(15, 12.0, speeding_up(12.0, 30.0))
+
+
+@pytest.mark.parametrize(("off_m", "expected"), [(START_M - 0.01, True), (START_M + 0.01, False)])
+def test_a_prediction_begins_where_the_target_is(off_m: float, expected: bool) -> None:
+    path = driving().trajectories[0, 0] + [0.0, off_m]
+    assert accepted(ObjectClass.CAR, 12.0, path) is expected

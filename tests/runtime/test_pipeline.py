@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +21,13 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import Prediction
 from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.prediction.watched import Model
 from eqrt.runtime.replay import replay
 from tiny_sensor import COUNTED, first, header, profile_of
 
 CARS = (
-    Car(object_id=3, x_m=20.0, y_m=0.0),
     Car(object_id=7, x_m=5.0, y_m=3.5, speed_mps=12.0),
+    Car(object_id=3, x_m=20.0, y_m=0.0),
     Car(object_id=9, x_m=60.0, y_m=-3.5, speed_mps=0.0),
 )
 POSE = Pose2(0.0, 0.0, 0.0)
@@ -52,19 +53,21 @@ def poll(pipeline: Pipeline, start_s: float, end_s: float) -> list[ForecastSet]:
 
 
 def test_every_object_is_predicted_in_every_cycle() -> None:
-    """From where it was last measured, at its speed, under an id of our own that stays."""
+    """From where it was last measured, at its speed, under an id of our own that stays; the nearest
+    first.
+    """
     forecasts = feed(pipeline_of(), traffic(CARS, 3.0, start_s=1000.0))
     assert len(forecasts) == 31
     for number, forecast in enumerate(forecasts):
         assert forecast.cycle == number
         assert forecast.timestamp_s == pytest.approx(1000.0 + number / 10, abs=1e-6)
-        np.testing.assert_array_equal(forecast.object_id, [3, 7, 9])
+        np.testing.assert_array_equal(forecast.object_id, [7, 3, 9])
         np.testing.assert_array_equal(forecast.track_id, forecasts[0].track_id)
         np.testing.assert_allclose(forecast.anchor_s, forecast.timestamp_s)
         x_m = [car.x_m + car.speed_mps * number / 10 for car in CARS]
         np.testing.assert_allclose(forecast.position[:, 0], x_m, atol=0.005)
     last = forecasts[-1]
-    np.testing.assert_allclose(last.velocity, [[10.0, 0.0], [12.0, 0.0], [0.0, 0.0]], atol=0.05)
+    np.testing.assert_allclose(last.velocity, [[12.0, 0.0], [10.0, 0.0], [0.0, 0.0]], atol=0.05)
     contract = shipped_predictor().contract
     assert last.trajectories.shape == (3, contract.num_modes, contract.horizon_steps, 2)
     assert last.dt_s == contract.dt_s
@@ -75,7 +78,7 @@ def test_predictions_go_on_from_the_measurement() -> None:
     """One second ahead, a car that drives steadily is where it will be within two metres."""
     last = feed(pipeline_of(), traffic(CARS, 3.0))[-1]
     steps = round(1.0 / last.dt_s)
-    expected = last.position + np.array([[10.0, 0.0], [12.0, 0.0], [0.0, 0.0]])
+    expected = last.position + np.array([[12.0, 0.0], [10.0, 0.0], [0.0, 0.0]])
     assert np.linalg.norm(last.trajectories[:, 0, steps - 1] - expected, axis=-1).max() < 2.0
 
 
@@ -104,7 +107,7 @@ def test_an_object_that_is_not_seen_keeps_its_anchor_and_then_goes() -> None:
         assert forecast.anchor_s[row] == pytest.approx(2.0)
         assert forecast.anchor_s[1 - row] == pytest.approx(forecast.timestamp_s)
         assert forecast.age_s[row] == pytest.approx(forecast.made_s - 2.0)
-        np.testing.assert_allclose(forecast.position[row], [29.0, 3.5], atol=0.005)
+        np.testing.assert_allclose(forecast.position[row], [40.0, 0.0], atol=0.005)
 
 
 def test_cycles_that_come_too_close_share_a_prediction() -> None:
@@ -186,7 +189,7 @@ def test_an_unfinished_cycle_is_predicted_when_its_time_is_over() -> None:
     pipeline = pipeline_of()
     assert feed(pipeline, cycle(CARS[:2], 0.0)[:-1]) == []
     (forecast,) = poll(pipeline, 0.0, 0.1)
-    np.testing.assert_array_equal(forecast.object_id, [3, 7])
+    np.testing.assert_array_equal(forecast.object_id, [7, 3])
 
 
 def test_finishing_closes_what_is_open() -> None:
@@ -236,27 +239,59 @@ def test_predictions_turn_and_move_with_the_map() -> None:
     np.testing.assert_allclose(elsewhere.apply(here.trajectories), there.trajectories, atol=1e-3)
 
 
-class Altered:
-    """The shipped model, something done to what it says."""
+class Stub:
+    """The shipped model, until told otherwise."""
+
+    def __init__(self) -> None:
+        self.contract: ModelContract = shipped_predictor().contract
+        self.model_id = "stub"
+        self.runs = 0
+
+    def predict(self, scene: Scene) -> Prediction:
+        self.runs += 1
+        return shipped_predictor().predict(scene)
+
+    def again(self) -> Model:
+        return Stub()
+
+
+class Altered(Stub):
+    """Something is done to what it says."""
 
     def __init__(self, rows: slice, value: float) -> None:
-        self.contract: ModelContract = shipped_predictor().contract
-        self.model_id = "altered"
+        super().__init__()
         self._rows, self._value = rows, value
 
     def predict(self, scene: Scene) -> Prediction:
-        prediction = shipped_predictor().predict(scene)
+        prediction = super().predict(scene)
         trajectories = prediction.trajectories.copy()
         trajectories[self._rows, :, 10:] = self._value
         return replace(prediction, trajectories=trajectories)
 
 
+class Raising(Stub):
+    """Raises in some of its runs."""
+
+    def __init__(self, runs: Container[int]) -> None:
+        super().__init__()
+        self._raising = runs
+
+    def predict(self, scene: Scene) -> Prediction:
+        prediction = super().predict(scene)
+        if self.runs - 1 in self._raising:
+            raise RuntimeError("out of memory")
+        return prediction
+
+
+def pipeline_with(model: Model, clock: Callable[[], float] | None = None) -> Pipeline:
+    return Pipeline(load_profile("generic"), model, clock=clock)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
 def test_an_impossible_prediction_is_replaced_and_marked(value: float) -> None:
     """For one car: the cycle goes on. For all of them: the cycle says so."""
-    profile = load_profile("generic")
     for rows, mode in ((slice(1, 2), Mode.NO_MAP), (slice(None), Mode.FALLBACK)):
-        pipeline = Pipeline(profile, Altered(rows, value))  # type: ignore[arg-type]  # else the same
+        pipeline = pipeline_with(Altered(rows, value))
         last = feed(pipeline, traffic(CARS, 2.0))[-1]
         assert last.mode is mode
         fell_back = last.agent_mode == Mode.FALLBACK
@@ -266,15 +301,87 @@ def test_an_impossible_prediction_is_replaced_and_marked(value: float) -> None:
         np.testing.assert_allclose(last.trajectories[1, 0, -1], end[1], atol=0.2)
 
 
+def test_a_model_that_raises_costs_its_cycle_and_no_other() -> None:
+    """Physics answers for it; the cycle's mode stays for half a second, the objects' do not."""
+    pipeline = pipeline_with(Raising({5}))
+    forecasts = feed(pipeline, traffic(CARS, 2.0))
+    assert len(forecasts) == 21
+    fell_back = [bool((f.agent_mode == Mode.FALLBACK).all()) for f in forecasts]
+    assert fell_back == [number == 5 for number in range(21)]
+    modes = [forecast.mode for forecast in forecasts]
+    assert modes == [Mode.NO_MAP] * 5 + [Mode.FALLBACK] * 5 + [Mode.NO_MAP] * 11
+    assert np.isfinite(forecasts[5].trajectories).all()
+    assert (pipeline.counters.model_errors, pipeline.counters.fallbacks) == (1, 3)
+
+
 def test_a_prediction_that_took_longer_than_a_period_says_so() -> None:
-    """By a clock on which every look takes 40 ms."""
+    """By a clock on which every look takes 30 ms: over when the model has answered."""
     looks = itertools.count()
-    pipeline = Pipeline(
-        load_profile("generic"), shipped_predictor(), clock=lambda: 0.04 * next(looks)
-    )
+    pipeline = pipeline_with(shipped_predictor(), clock=lambda: 0.03 * next(looks))
     (forecast,) = feed(pipeline, cycle(CARS, 0.0))
     assert forecast.mode is Mode.LATE
     assert forecast.compute_s > 0.1
+
+
+class Slow(Stub):
+    """Takes its time, by a clock of its own that the pipeline goes by."""
+
+    def __init__(self, seconds_per_run: float) -> None:
+        super().__init__()
+        self.now_s = 0.0
+        self._seconds = seconds_per_run
+
+    def predict(self, scene: Scene) -> Prediction:
+        self.now_s += self._seconds
+        return super().predict(scene)
+
+    def clock(self) -> float:
+        return self.now_s
+
+
+def crowd(count: int) -> list[Car]:
+    """Cars that stand 2 m apart ahead of the ego vehicle, the farthest first."""
+    return [Car(object_id=n, x_m=10.0 + 2.0 * n, y_m=0.0, speed_mps=0.0) for n in range(count)][
+        ::-1
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seconds_per_run", "predicted"), [(0.01, 80), (0.02, 48), (0.03, 32), (0.05, 16)]
+)
+def test_what_there_is_no_time_for_is_the_farthest(seconds_per_run: float, predicted: int) -> None:
+    """80 cars in batches of 16, in the 70 ms of a cycle: the rest goes by physics and says so."""
+    model = Slow(seconds_per_run)
+    pipeline = pipeline_with(model, model.clock)
+    (forecast,) = pipeline_fed(pipeline, cycle(crowd(80), 0.0), 0.0)
+    np.testing.assert_array_equal(forecast.object_id, np.arange(80))
+    late = forecast.agent_mode == Mode.LATE
+    np.testing.assert_array_equal(np.flatnonzero(late), np.arange(predicted, 80))
+    assert (forecast.agent_mode[:predicted] == Mode.PARTIAL).all()
+    assert forecast.mode is (Mode.LATE if predicted < 80 else Mode.NO_MAP)
+    standing = np.broadcast_to(forecast.position[:, None, None], forecast.trajectories.shape)
+    np.testing.assert_array_equal(forecast.trajectories[late], standing[late])
+    assert pipeline.counters.shed == 80 - predicted
+    assert pipeline.counters.fallbacks == 0
+
+
+def test_a_cycle_that_waited_too_long_is_not_given_to_the_model() -> None:
+    """It came 80 ms ago: nothing queues up behind it."""
+    model = Slow(0.01)
+    model.now_s = 0.08
+    pipeline = pipeline_with(model, model.clock)
+    (forecast,) = pipeline_fed(pipeline, cycle(CARS, 0.0), 0.0)
+    assert (forecast.agent_mode == Mode.LATE).all()
+    assert (forecast.mode, model.runs) == (Mode.LATE, 0)
+    (forecast,) = pipeline_fed(pipeline, cycle(CARS, 0.1), 0.1)  # 20 ms early
+    assert (forecast.agent_mode == Mode.PARTIAL).all()
+
+
+def pipeline_fed(
+    pipeline: Pipeline, messages: Iterable[can.Message], arrived_s: float
+) -> list[ForecastSet]:
+    """All at the same time."""
+    return [made for message in messages for made in pipeline.feed(message, arrived_s)]
 
 
 def test_a_messages_channel_decides_which_bus_it_is_of() -> None:

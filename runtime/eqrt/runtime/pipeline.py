@@ -1,6 +1,6 @@
 """From CAN messages to predictions, as one function of its inputs.
 
-    messages -> Decoder -> detections -> EgoTracker -> TrackStore -> scene -> Predictor -> guard
+    messages -> Decoder -> detections -> EgoTracker -> TrackStore -> Forecaster -> guard
 
 The pipeline opens nothing and waits for nothing: `serve` gives it messages and the monotonic clock,
 `replay` gives it a log and the log's clock, and the same messages make the same predictions.
@@ -9,25 +9,26 @@ The pipeline opens nothing and waits for nothing: `serve` gives it messages and 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import can
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
 from eqrt.core.lane_choice import centerline_source
-from eqrt.core.scene import AgentHistories, Scene, build_scene, concatenate, tile_origin
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
 from eqrt.runtime.decoding.profile import Profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.prediction.forecaster import Deadline, Forecaster, Raw
 from eqrt.runtime.prediction.guard import Guarded, guard
-from eqrt.runtime.prediction.predictor import Predictor
+from eqrt.runtime.prediction.modes import ModeKeeper
+from eqrt.runtime.prediction.targets import Targets
 from eqrt.runtime.prediction.tiles import Tile
+from eqrt.runtime.prediction.watched import Direct, Model, Watched
 from eqrt.runtime.tracking.ego import EgoState, EgoTracker
-from eqrt.runtime.tracking.tracks import Tracks, TrackStore
+from eqrt.runtime.tracking.tracks import TrackStore
 
 MIN_PERIOD = 0.6
 """Cycles closer together than this many model steps share a prediction: radars send up to 20 Hz."""
@@ -35,14 +36,14 @@ TARGET_AGE_S = 0.3
 """A track unseen for longer is not predicted any more."""
 NEIGHBOR_AGE_S = 0.5
 """A track unseen for longer does not stand in any target's scene: `scene.RECENT_STEPS`."""
+SHED_PERIODS = 0.7
+"""Of the model's period, counted from the arrival of a cycle's last message: what could not be
+predicted by then is left to physics, so that the rest leaves in time and nothing queues up."""
 SILENT_PERIODS = 3
 """After this many model steps without a cycle, everything said before is void."""
 _FINISH_S = 1.0  # longer than any profile's timeout
 _CONTROL_S = 0.01  # how often silence and unfinished cycles are looked for
 _MAX_CLOCK_STEP_S = 1.0  # a cycle older than the newest by more: the clock was set back
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(slots=True)
@@ -63,7 +64,15 @@ class PipelineCounters:
     """Predictions made, also those of nothing."""
     targets: int = 0
     fallbacks: int = 0
-    """Targets whose prediction the guard refused."""
+    """Targets that the model failed on, or whose prediction the guard refused."""
+    shed: int = 0
+    """Targets for which there was no time."""
+    model_errors: int = 0
+    """Runs of the model that raised an error."""
+    model_overruns: int = 0
+    """Runs that were given up because their time was over."""
+    model_restarts: int = 0
+    """Times that the model was loaded anew because it was stuck or kept failing."""
     skipped: int = 0
     """Sensor cycles measured before or too soon after a prediction to get their own."""
 
@@ -74,7 +83,7 @@ class Pipeline:
     def __init__(
         self,
         profile: Profile,
-        predictor: Predictor,
+        predictor: Model,
         tile: Tile | None = None,
         *,
         channels: Mapping[str, str | int] | None = None,
@@ -97,9 +106,17 @@ class Pipeline:
         self.profile = profile
         self.predictor = predictor
         self.tile = tile
-        self._lanes = centerline_source(tile.lane_map, predictor.contract) if tile else None
         self._clock = clock
-        self._nobody = _nobody(predictor.contract)
+        self._runner = Direct(predictor) if clock is None else Watched(predictor)
+        self._forecaster = Forecaster(
+            predictor.contract,
+            self._runner,
+            centerline_source(tile.lane_map, predictor.contract) if tile else None,
+            self.tracks,
+            self.ego,
+        )
+        self._modes = ModeKeeper()
+        self._nobody = Raw.silent(Targets.none(predictor.contract), predictor.contract)
         self._controlled_s = -np.inf
         self._predicted_s = -np.inf
         self._silent_due_s = np.inf
@@ -157,83 +174,55 @@ class Pipeline:
         tracks = self.tracks.snapshot(moment.measured_s, NEIGHBOR_AGE_S)
         alive = tracks.timestamp_s >= moment.measured_s - TARGET_AGE_S
         if ego is None or not alive.any():
-            return self._forecast(*self._nobody, ego, moment)
-        begun_s = self._time(moment.now_s)
-        scene, targets = self._targets(tracks, alive, ego)
-        scene_s = self._time(moment.now_s)
-        prediction = self.predictor.predict(scene)
-        infer_s = self._time(moment.now_s)
-        guarded = guard(
-            prediction.trajectories,
-            prediction.probabilities.astype(np.float64),
-            targets.history,
-            targets.valid,
-            self.predictor.contract.dt_s,
-        )
-        self.times.scene_s, self.times.infer_s = scene_s - begun_s, infer_s - scene_s
-        self.times.guard_s = self._time(moment.now_s) - infer_s
-        self.counters.fallbacks += int(np.count_nonzero(~guarded.accepted))
-        return self._forecast(targets, guarded, ego, moment)
+            return self._forecast(self._nobody, ego, moment)
+        raw = self._forecaster.predict(tracks, alive, ego, self._deadline(moment))
+        self.times.scene_s, self.times.infer_s = raw.scene_s, raw.infer_s
+        return self._forecast(raw, ego, moment)
 
-    def _targets(self, tracks: Tracks, alive: Bool, ego: EgoState) -> tuple[Scene, _Targets]:
-        """Every track that is alive as a target, its history ending at its own last measurement.
-
-        Targets measured at the same time share a clock, so one scene is built per time.
-        """
-        origin = tile_origin(np.array([ego.map_from_ego.x_m, ego.map_from_ego.y_m]))
-        scenes, parts = [], []
-        for anchor_s in np.unique(tracks.timestamp_s[alive]):
-            rows = np.flatnonzero(tracks.timestamp_s == anchor_s)
-            agents = self._agents(tracks, float(anchor_s))
-            scenes.append(self._scene(agents, rows, ego, origin))
-            parts.append(_Targets.of(tracks, agents, rows))
-        return concatenate(scenes), _Targets.join(parts)
-
-    def _scene(
-        self, agents: AgentHistories, targets: NDArray[np.intp], ego: EgoState, origin: Float64
-    ) -> Scene:
-        lanes = self._lanes if ego.has_map_pose else None
-        return build_scene(agents, targets, self.predictor.contract, lanes, origin)
-
-    def _agents(self, tracks: Tracks, anchor_s: float) -> AgentHistories:
-        """All tracks, and the ego vehicle after them, on the clock that ends at `anchor_s`."""
-        contract = self.predictor.contract
-        steps, dt_s = contract.history_steps, contract.dt_s
-        positions, valid = self.tracks.history(anchor_s, steps, dt_s, tracks.row)
-        facing = np.stack([np.cos(tracks.heading_rad), np.sin(tracks.heading_rad)], axis=-1)
-        heading = np.where(np.isfinite(facing), facing, 0.0)
-        past = [self.ego.map_from_ego(anchor_s - k * dt_s) for k in range(steps - 1, -1, -1)]
-        own = [(np.nan, np.nan) if pose is None else (pose.x_m, pose.y_m) for pose in past]
-        seen = [pose is not None for pose in past]
-        return AgentHistories(
-            positions=np.concatenate([positions, np.array(own)[None]]),
-            valid=np.concatenate([valid, np.array(seen)[None]]),
-            heading=np.concatenate([heading, np.zeros((1, 2))]),
-        )
+    def _deadline(self, moment: _Moment) -> Deadline:
+        if self._clock is None:
+            return Deadline(lambda: moment.now_s, np.inf, np.inf)
+        dt_s = self.predictor.contract.dt_s
+        return Deadline(self._clock, moment.now_s + SHED_PERIODS * dt_s, moment.now_s + dt_s)
 
     def _forecast(
-        self, targets: _Targets, guarded: Guarded, ego: EgoState | None, moment: _Moment
+        self, raw: Raw, ego: EgoState | None, moment: _Moment, *, silent: bool = False
     ) -> ForecastSet:
+        begun_s = self._time(moment.now_s)
+        targets, dt_s = raw.targets, self.predictor.contract.dt_s
+        guarded = guard(
+            raw.trajectories,
+            raw.probabilities,
+            targets.history,
+            targets.valid,
+            dt_s,
+            object_class=targets.object_class,
+            covariances=raw.covariances,
+        )
         made_s = self._time(moment.now_s)
-        compute_s = made_s - moment.started_s
-        self.counters.cycles += 1
-        self.counters.targets += len(targets.track_id)
-        seen = np.where(targets.valid.all(axis=1), Mode.RUN, Mode.PARTIAL)
+        self.times.guard_s = made_s - begun_s
+        self._count(raw, guarded)
+        late = made_s - moment.now_s > dt_s or bool(raw.late.any())
+        mode = Mode.SILENT
+        if not silent:
+            reasons = self._reasons(raw, guarded, ego, late)
+            mode = self._modes.cycle(reasons, moment.now_s)
+        used_tile = self.tile if raw.has_lanes else None
         return ForecastSet(
             cycle=self.counters.cycles - 1,
             timestamp_s=moment.measured_s,
             made_s=made_s,
-            compute_s=compute_s,
-            mode=self._mode(ego, guarded, compute_s),
+            compute_s=made_s - moment.started_s,
+            mode=mode,
             model_id=self.predictor.model_id,
-            tile_id=self.tile.info.tile_id if self.tile else "",
+            tile_id=used_tile.info.tile_id if used_tile else "",
             map_from_ego=ego.map_from_ego if ego else Pose2(),
             ego_speed_mps=ego.velocity[0] if ego else np.nan,
-            dt_s=self.predictor.contract.dt_s,
+            dt_s=dt_s,
             track_id=targets.track_id,
             object_id=targets.object_id,
             anchor_s=targets.anchor_s,
-            agent_mode=np.where(guarded.accepted, seen, Mode.FALLBACK).astype(np.uint8),
+            agent_mode=_agent_modes(raw, guarded),
             position=targets.history[:, -1],
             velocity=guarded.velocity,
             heading_rad=targets.heading_rad,
@@ -244,20 +233,33 @@ class Pipeline:
             history_valid=targets.valid,
             trajectories=guarded.trajectories,
             probabilities=guarded.probabilities,
+            covariances=guarded.covariances,
         )
 
-    def _mode(self, ego: EgoState | None, guarded: Guarded, compute_s: float) -> Mode:
-        if len(guarded.accepted) and not guarded.accepted.any():
-            return Mode.FALLBACK
-        if ego is None or (self.tile is not None and not ego.has_map_pose):
-            return Mode.NO_POSE
-        if compute_s > self.predictor.contract.dt_s:
-            return Mode.LATE
-        return Mode.RUN if self.tile else Mode.NO_MAP
+    def _count(self, raw: Raw, guarded: Guarded) -> None:
+        counters = self.counters
+        counters.cycles += 1
+        counters.targets += len(raw.targets)
+        counters.shed += int(np.count_nonzero(raw.late))
+        counters.fallbacks += int(np.count_nonzero(~guarded.accepted & ~raw.late))
+        counters.model_errors = self._runner.errors
+        counters.model_overruns = self._runner.overruns
+        counters.model_restarts = self._runner.restarts
+
+    def _reasons(self, raw: Raw, guarded: Guarded, ego: EgoState | None, late: bool) -> set[Mode]:
+        """All that is wrong with a cycle."""
+        refused = ~guarded.accepted & ~raw.late
+        found = {
+            Mode.FALLBACK: refused.any() and not guarded.accepted.any(),
+            Mode.NO_POSE: ego is None or (self.tile is not None and not ego.has_map_pose),
+            Mode.LATE: late,
+            Mode.NO_MAP: self.tile is None or (guarded.accepted.any() and not raw.has_lanes),
+        }
+        return {mode for mode, holds in found.items() if holds}
 
     def _silence(self, now_s: float) -> ForecastSet:
-        said = self._forecast(*self._nobody, None, _Moment(self._predicted_s, now_s, now_s))
-        return replace(said, mode=Mode.SILENT)
+        moment = _Moment(self._predicted_s, now_s, now_s)
+        return self._forecast(self._nobody, None, moment, silent=True)
 
     def _time(self, now_s: float) -> float:
         return now_s if self._clock is None else self._clock()
@@ -275,60 +277,11 @@ class _Moment:
     """Work on it began."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Targets:
-    """The targets of one prediction, B of them."""
-
-    track_id: NDArray[np.int64]
-    object_id: NDArray[np.int64]
-    anchor_s: Float64
-    heading_rad: Float64
-    object_class: NDArray[np.uint8]
-    length_m: Float64
-    width_m: Float64
-    history: Float64
-    """(B, T, 2) map frame; the last step is a measurement."""
-    valid: Bool
-    """(B, T)"""
-
-    @classmethod
-    def of(cls, tracks: Tracks, agents: AgentHistories, rows: NDArray[np.intp]) -> _Targets:
-        """The tracks `rows`, on the clock of `agents`."""
-        return cls(
-            track_id=tracks.track_id[rows],
-            object_id=tracks.object_id[rows],
-            anchor_s=tracks.timestamp_s[rows],
-            heading_rad=tracks.heading_rad[rows],
-            object_class=tracks.object_class[rows],
-            length_m=tracks.length_m[rows],
-            width_m=tracks.width_m[rows],
-            history=agents.positions[rows],
-            valid=agents.valid[rows],
-        )
-
-    @classmethod
-    def join(cls, parts: list[_Targets]) -> _Targets:
-        """The targets of all parts."""
-        names = [f.name for f in fields(cls)]
-        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
-
-
-def _nobody(contract: ModelContract) -> tuple[_Targets, Guarded]:
-    """No targets, and the prediction of none."""
-    targets = _Targets(
-        track_id=np.zeros(0, np.int64),
-        object_id=np.zeros(0, np.int64),
-        anchor_s=np.zeros(0),
-        heading_rad=np.zeros(0),
-        object_class=np.zeros(0, np.uint8),
-        length_m=np.zeros(0),
-        width_m=np.zeros(0),
-        history=np.zeros((0, contract.history_steps, 2)),
-        valid=np.zeros((0, contract.history_steps), np.bool_),
-    )
-    shape = (0, contract.num_modes, contract.horizon_steps, 2)
-    guarded = Guarded(np.zeros(shape), np.zeros(shape[:2]), np.zeros(0, np.bool_), np.zeros((0, 2)))
-    return targets, guarded
+def _agent_modes(raw: Raw, guarded: Guarded) -> NDArray[np.uint8]:
+    """(B,) how each target was predicted."""
+    seen = np.where(raw.targets.valid.all(axis=1), Mode.RUN, Mode.PARTIAL)
+    fell_back = np.where(raw.late, Mode.LATE, Mode.FALLBACK)
+    return np.where(guarded.accepted, seen, fell_back).astype(np.uint8)
 
 
 _NOTHING: list[ForecastSet] = []

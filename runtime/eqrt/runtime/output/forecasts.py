@@ -19,22 +19,26 @@ from eqrt.core.frames import Pose2
 class Mode(IntEnum):
     """How a cycle, or one target of it, was predicted; the numbers are those of `eqrt.dbc`.
 
-    A cycle carries the first that holds of SILENT, FALLBACK (of every target), NO_POSE, LATE and
-    NO_MAP, else RUN. A target carries FALLBACK, PARTIAL or RUN, for its own prediction.
+    A target carries RUN, PARTIAL, LATE or FALLBACK, for this prediction of it. A cycle carries the
+    gravest of SILENT, FALLBACK, NO_POSE, LATE and NO_MAP that holds, or held until just now
+    (`eqrt.runtime.prediction.modes`), else RUN.
     """
 
     RUN = 0
     """The model's prediction, from full histories, a pose and a map."""
     NO_MAP = 1
-    """No tile here: the model was given no centerlines."""
+    """No tile, or no lane of it near any target: the model was given no centerlines."""
     NO_POSE = 2
     """No ego motion is known (nothing is predicted), or no map pose (predicted without the map)."""
     PARTIAL = 3
     """The target has been seen for less than the model's history."""
     LATE = 4
-    """The prediction took longer than one period."""
+    """Of a cycle: out later than one period after its input, or some of its targets are late.
+
+    Of a target: there was no time for the model; constant turn rate and velocity instead.
+    """
     FALLBACK = 5
-    """The model was absent or its output impossible: constant turn rate and velocity instead."""
+    """The model failed, or its output was impossible: constant turn rate and velocity instead."""
     SILENT = 6
     """No input for three periods: nothing is predicted, whatever was said before is void."""
 

@@ -1,7 +1,8 @@
 """The last check before a prediction leaves: finite, continuous and physically possible.
 
 A target whose prediction fails falls back to constant turn rate and velocity (CTRV) from its own
-history, alone, and says so. The limits are wide: they catch a broken model, not a bold one.
+history, alone, and says so. So does a target that the model said nothing about (NaN). The limits
+are wide: they catch a broken model, not a bold one.
 """
 
 from __future__ import annotations
@@ -12,18 +13,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.kinematics import constant_turn, fit_motion
+from eqrt.runtime.decoding.detections import ObjectClass
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-MAX_SPEED_MPS = 90.0
-"""Above anything on a public road."""
-MAX_ACCELERATION_MPS2 = 15.0
-"""1.5 g, averaged over WINDOW_STEPS: tyres give about 1 g."""
-WINDOW_STEPS = 5
-"""Half a second: single steps may jitter by centimetres."""
 START_M = 2.0
 """How far the first step may lie from where the target is and was going."""
+WINDOW_STEPS = 5
+"""Accelerations are means over half a second: single steps may jitter by centimetres."""
+TURNING_MPS = 3.0
+"""Slower than this, a limit of curvature would be one of centimetres."""
+MAX_GAIN_MPS = 10.0
+"""A target measured to be faster than its class allows may go on so, and this much faster."""
+_SUM_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a class of road users can do, with room."""
+
+    speed_mps: float
+    along_mps2: float
+    """Speeding up and braking: tyres on a dry road give about 10 m/s^2."""
+    across_mps2: float
+    """Turning."""
+    curvature_per_m: float
+    """One over the radius of the tightest turn."""
+
+
+LIMITS = {
+    ObjectClass.UNKNOWN: Limits(90.0, 15.0, 15.0, np.inf),
+    ObjectClass.CAR: Limits(90.0, 15.0, 15.0, 0.5),
+    ObjectClass.TRUCK: Limits(50.0, 13.0, 11.0, 0.35),
+    ObjectClass.MOTORCYCLE: Limits(90.0, 15.0, 15.0, 0.7),
+    ObjectClass.BICYCLE: Limits(25.0, 10.0, 10.0, 1.5),
+    ObjectClass.PEDESTRIAN: Limits(12.0, 10.0, 10.0, np.inf),
+    ObjectClass.ANIMAL: Limits(25.0, 15.0, 15.0, np.inf),
+    ObjectClass.STATIC: Limits(90.0, 15.0, 15.0, np.inf),  # the sensor may be wrong
+}
+_TABLE = np.array(
+    [
+        (limits.speed_mps, limits.along_mps2, limits.across_mps2, limits.curvature_per_m)
+        for _, limits in sorted(LIMITS.items())
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +68,8 @@ class Guarded:
     """(B, K, H, 2) map frame."""
     probabilities: Float64
     """(B, K)"""
+    covariances: Float64 | None
+    """(B, K, H, 2, 2) NaN for a target that fell back; None from a model that predicts none."""
     accepted: Bool
     """(B,) False: this target fell back to CTRV."""
     velocity: Float64
@@ -41,46 +77,76 @@ class Guarded:
 
 
 def guard(
-    trajectories: Float64, probabilities: Float64, history: Float64, valid: Bool, dt_s: float
+    trajectories: Float64,
+    probabilities: Float64,
+    history: Float64,
+    valid: Bool,
+    dt_s: float,
+    *,
+    object_class: NDArray[np.uint8] | None = None,
+    covariances: Float64 | None = None,
 ) -> Guarded:
     """Check trajectories (B, K, H, 2) against the targets' own histories (B, T, 2), map frame.
 
-    The last step of every history must be valid.
+    The last step of every history must be valid. `object_class` (B,): None = unknown.
     """
     velocity, turn_rate = fit_motion(history, valid, dt_s)
     position = history[:, -1]
-    accepted = _possible(trajectories, probabilities, position, velocity, dt_s)
+    known = np.zeros(len(history), np.uint8) if object_class is None else object_class
+    accepted = _finite(trajectories, probabilities, covariances)
+    path = np.where(accepted[:, None, None, None], trajectories, position[:, None, None])
+    accepted &= _possible(path, position, velocity, dt_s, known)
     if accepted.all():
-        return Guarded(trajectories, probabilities, accepted, velocity)
-    steps = trajectories.shape[2]
-    course = constant_turn(position, velocity, turn_rate, steps, dt_s)[:, None]  # (B, 1, H, 2)
+        return Guarded(trajectories, probabilities, covariances, accepted, velocity)
+    course = constant_turn(position, velocity, turn_rate, trajectories.shape[2], dt_s)
     certain = np.zeros_like(probabilities)
     certain[:, 0] = 1.0
+    if covariances is not None:
+        covariances = np.where(accepted[:, None, None, None, None], covariances, np.nan)
     return Guarded(
-        np.where(accepted[:, None, None, None], trajectories, course),
+        np.where(accepted[:, None, None, None], trajectories, course[:, None]),
         np.where(accepted[:, None], probabilities, certain),
+        covariances,
         accepted,
         velocity,
     )
 
 
+def _finite(trajectories: Float64, probabilities: Float64, covariances: Float64 | None) -> Bool:
+    """(B,) numbers, probabilities that sum to one."""
+    finite = np.isfinite(trajectories).all(axis=(1, 2, 3))
+    finite &= np.abs(probabilities.sum(axis=1) - 1.0) <= _SUM_TOLERANCE  # no for NaN and infinity
+    if covariances is not None:
+        finite &= np.isfinite(covariances).all(axis=(1, 2, 3, 4))
+    return np.asarray(finite)
+
+
 def _possible(
-    trajectories: Float64, probabilities: Float64, position: Float64, velocity: Float64, dt_s: float
+    path: Float64, position: Float64, velocity: Float64, dt_s: float, known: NDArray[np.uint8]
 ) -> Bool:
-    """(B,) whether every mode of a target is finite, continuous and within the limits."""
-    finite: Bool = np.asarray(
-        np.isfinite(trajectories).all(axis=(1, 2, 3)) & np.isfinite(probabilities).all(axis=1)
-    )
-    path = np.where(finite[:, None, None, None], trajectories, position[:, None, None])
-    first = np.linalg.norm(path[:, :, 0] - (position + velocity * dt_s)[:, None], axis=-1)
+    """(B,) whether every mode of a target is continuous and within its class's limits."""
+    first_m = np.linalg.norm(path[:, :, 0] - (position + velocity * dt_s)[:, None], axis=-1)
     step = np.diff(path, axis=2) / dt_s  # (B, K, H - 1, 2) m/s
-    speed = np.linalg.norm(step, axis=-1)
+    rows = _TABLE[np.minimum(known, len(_TABLE) - 1)]
+    max_speed, *others = rows.T[..., None, None]  # (B, 1, 1) each
+    measured = np.linalg.norm(velocity, axis=-1)[:, None, None] + MAX_GAIN_MPS
+    within = (np.linalg.norm(step, axis=-1) <= np.maximum(max_speed, measured)).all(axis=-1)
+    within &= (first_m <= START_M) & _turns_possibly(step, dt_s, *others)
+    return np.asarray(within.all(axis=1))
+
+
+def _turns_possibly(
+    step: Float64, dt_s: float, along: Float64, across: Float64, curvature: Float64
+) -> Bool:
+    """(B, K) whether the velocities (B, K, H - 1, 2) change as limits of (B, 1, 1) allow."""
     window = min(WINDOW_STEPS, step.shape[2] - 1)
-    change = np.linalg.norm(step[:, :, window:] - step[:, :, :-window], axis=-1) / (window * dt_s)
-    within = (
-        (first <= START_M).all(axis=1)
-        & (speed <= MAX_SPEED_MPS).all(axis=(1, 2))
-        & (change <= MAX_ACCELERATION_MPS2).all(axis=(1, 2))
-    )
-    sums = np.abs(np.where(finite[:, None], probabilities, 1.0).sum(axis=1) - 1.0) <= 1e-3
-    return np.asarray(finite & within & sums)
+    before, after = step[:, :, :-window], step[:, :, window:]
+    change = (after - before) / (window * dt_s)
+    mean = 0.5 * (before + after)
+    direction = mean / np.maximum(np.linalg.norm(mean, axis=-1), 1e-6)[..., None]
+    speed = 0.5 * (np.linalg.norm(before, axis=-1) + np.linalg.norm(after, axis=-1))
+    forward = np.abs((change * direction).sum(axis=-1))
+    sideways = np.abs(change[..., 0] * direction[..., 1] - change[..., 1] * direction[..., 0])
+    moving = np.maximum(speed, TURNING_MPS)
+    most = np.minimum(across, curvature * moving**2)
+    return np.asarray(((forward <= along) & (sideways <= most)).all(axis=-1))

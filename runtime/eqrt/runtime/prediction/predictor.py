@@ -56,6 +56,7 @@ class Predictor:
         metadata: Mapping[str, str],
     ) -> None:
         self._session = session
+        self._loaded_from: tuple[Path, int] | None = None
         self.contract = contract
         self._outputs = list(contract.outputs)
         self.model_id = sha256[:8]
@@ -83,7 +84,9 @@ class Predictor:
             )
         contract = ModelContract.from_json(text, str(folder / "model.onnx"))
         _check_tensors(session, contract, folder)
-        predictor = cls(session, contract, hashlib.sha256(content).hexdigest(), metadata)
+        sha256 = hashlib.sha256(content).hexdigest()
+        predictor = cls(session, contract, sha256, metadata)
+        predictor._loaded_from = folder, threads
         predictor._self_check(folder)
         return predictor
 
@@ -106,6 +109,12 @@ class Predictor:
             found["probabilities"],
             None if covariances is None else covariances.astype(np.float64),
         )
+
+    def again(self) -> Predictor:
+        """The same artifact, loaded anew. Raises ContractError, as `load` does."""
+        if self._loaded_from is None:
+            raise ContractError(f"{self.contract.name}: not loaded from an artifact")
+        return Predictor.load(*self._loaded_from)
 
     @property
     def license_notice(self) -> str | None:

@@ -1,0 +1,177 @@
+"""Running a model that may raise, or never come back, without going down with it.
+
+The model runs in a thread of its own, so that the service can stop waiting for it: what is not
+predicted in time falls back to physics, and the service goes on. A model that is stuck, or fails
+again and again, is loaded anew.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from typing import Protocol
+
+from eqrt.core.contract import ModelContract
+from eqrt.core.errors import EqrtError
+from eqrt.core.scene import Scene
+from eqrt.runtime.prediction.predictor import Prediction
+
+STUCK_S = 2.0
+"""A run that takes longer does not come back."""
+MAX_ERRORS = 5
+"""So many runs in a row that raise: this session is broken."""
+_LONGEST_PAUSE_S = 60.0  # between two attempts to load the model anew: each takes some 0.2 s of CPU
+
+
+class Model(Protocol):
+    """What predicts: `Predictor`."""
+
+    contract: ModelContract
+    model_id: str
+
+    def predict(self, scene: Scene) -> Prediction:
+        """Predict all targets of the scene; may raise anything."""
+
+    def again(self) -> Model:
+        """The same model, loaded anew. Raises EqrtError."""
+
+
+class Failed(Exception):  # noqa: N818  # an outcome, which the caller expects
+    """The model said nothing."""
+
+
+class TooLate(Failed):
+    """It may say something yet, but this cycle's time is over."""
+
+
+class Direct:
+    """Runs a model and waits for it, however long it takes: where no time passes (replay)."""
+
+    def __init__(self, model: Model) -> None:
+        self.errors = 0
+        """Runs that raised."""
+        self.overruns = 0
+        """Runs that were given up."""
+        self.restarts = 0
+        """Times that the model was loaded anew."""
+        self._model = model
+
+    def run(self, scene: Scene, patience_s: float) -> Prediction:  # noqa: ARG002
+        """Predict. Raises Failed if the model raises."""
+        try:
+            return self._model.predict(scene)
+        except Exception as error:  # onnxruntime raises its own classes, with no common base
+            self.errors += 1
+            raise Failed(str(error)) from error
+
+
+class Watched:
+    """Runs a model in a thread, and stops waiting when its time is over."""
+
+    def __init__(self, model: Model) -> None:
+        self.errors = self.overruns = self.restarts = 0  # as of Direct
+        self._model = model
+        self._worker = _Worker(model)
+        self._begun_s = -math.inf
+        self._errors_in_a_row = 0
+        self._pause_s = STUCK_S
+        self._next_restart_s = -math.inf
+        self._successor: _Successor | None = None
+
+    def run(self, scene: Scene, patience_s: float) -> Prediction:
+        """Predict within `patience_s`.
+
+        Raises TooLate if that is over before, Failed if the model raises or is still at work on an
+        earlier scene.
+        """
+        self._replace_if_broken()
+        if self._worker.is_busy():
+            raise Failed("the model is still at work on an earlier scene")
+        self._begun_s = time.monotonic()
+        answer = self._worker.ask(scene, patience_s)
+        if answer is None:
+            self.overruns += 1
+            raise TooLate(f"no answer within {patience_s:.3f} s")
+        if isinstance(answer, Exception):
+            self.errors += 1
+            self._errors_in_a_row += 1
+            raise Failed(str(answer)) from answer
+        self._errors_in_a_row, self._pause_s = 0, STUCK_S
+        return answer
+
+    def _replace_if_broken(self) -> None:
+        """Have the model loaded anew, beside the loop; take it when it is there."""
+        now_s = time.monotonic()
+        if self._successor is not None:
+            if self._successor.is_loading():
+                return
+            if self._successor.model is not None:
+                self._worker, self._errors_in_a_row = _Worker(self._successor.model), 0
+                self.restarts += 1
+            self._successor = None
+        is_stuck = self._worker.is_busy() and now_s - self._begun_s > STUCK_S
+        if (is_stuck or self._errors_in_a_row >= MAX_ERRORS) and now_s >= self._next_restart_s:
+            self._next_restart_s = now_s + self._pause_s
+            self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
+            self._successor = _Successor(self._model)
+
+
+class _Worker:
+    """A thread with one model, which is asked one thing at a time.
+
+    Two locks are its doorbells: nothing in the standard library wakes a thread faster.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._asked, self._answered = threading.Lock(), threading.Lock()
+        self._asked.acquire()
+        self._answered.acquire()
+        self._scene: Scene | None = None
+        self._answer: Prediction | Exception | None = None
+        self._busy = False
+        threading.Thread(target=self._work, name="model", daemon=True).start()
+
+    def is_busy(self) -> bool:
+        """Still at work on something that nobody waits for any more."""
+        if self._busy and self._answered.acquire(blocking=False):
+            self._busy = False
+        return self._busy
+
+    def ask(self, scene: Scene, patience_s: float) -> Prediction | Exception | None:
+        """What the model says or raises; None = nothing yet."""
+        self._scene, self._busy = scene, True
+        self._asked.release()
+        if not self._answered.acquire(timeout=max(patience_s, 0.0)):
+            return None
+        self._busy = False
+        return self._answer
+
+    def _work(self) -> None:
+        while True:
+            self._asked.acquire()
+            try:
+                assert self._scene is not None
+                self._answer = self._model.predict(self._scene)
+            except Exception as error:
+                self._answer = error
+            self._answered.release()
+
+
+class _Successor:
+    """A model being loaded in a thread."""
+
+    def __init__(self, model: Model) -> None:
+        self.model: Model | None = None
+        self._thread = threading.Thread(target=self._load, args=[model], daemon=True)
+        self._thread.start()
+
+    def _load(self, model: Model) -> None:
+        try:
+            self.model = model.again()
+        except (EqrtError, OSError):
+            self.model = None  # damaged meanwhile: tried again after a pause
+
+    def is_loading(self) -> bool:
+        return self._thread.is_alive()
