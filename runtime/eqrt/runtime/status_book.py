@@ -6,16 +6,16 @@ import importlib.metadata
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
+from eqrt.runtime.decoding.decoder_counters import DecoderCounters
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+from eqrt.runtime.pipeline import Pipeline, PipelineCounters
+from eqrt.runtime.tracking.ego import EgoCounters
+from eqrt.runtime.tracking.tracks import TrackCounters
 
 
 class Counting(Protocol):
@@ -78,7 +78,7 @@ class StatusBook:
 
     def _totals(self) -> dict[str, int]:
         pipeline = self._pipeline
-        parts: dict[str, DataclassInstance] = {
+        parts: dict[str, DecoderCounters | EgoCounters | TrackCounters | PipelineCounters] = {
             "decoder": pipeline.decoder.counters,
             "ego": pipeline.ego.counters,
             "tracks": pipeline.tracks.counters,
