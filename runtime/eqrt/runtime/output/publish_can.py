@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import can
-import numpy as np
 
 from eqrt.core.errors import UsageError
 from eqrt.runtime.bus.buses import carries_fd
-from eqrt.runtime.output.can_output import Offset, Rows, encode_classic, encode_fd
+from eqrt.runtime.output.can_output import Offset, Rows, encode_classic, encode_fd, protect
 from eqrt.runtime.output.forecasts import ForecastSet
 
 BASE_ID = 0x6E0
@@ -53,18 +52,13 @@ class CanPublisher:
         else:
             messages = encode_classic(forecasts)
         for offset, rows in messages:
-            self._count(offset, rows)
+            protect(rows, self._base_id + offset, self._alive[offset])
+            self._alive[offset] = (self._alive[offset] + len(rows)) & 0xFF
             self._send(self._base_id + offset, rows)
 
     def counts(self) -> dict[str, int]:
         """Since the start, by name."""
         return {"can_sent": self.sent, "can_failed": self.failed}
-
-    def _count(self, offset: Offset, rows: Rows) -> None:
-        """Number the messages of one id, so that a consumer sees if one was lost."""
-        counts = self._alive[offset] + np.arange(len(rows))
-        rows["alive"] |= (counts & (0xFF if self.is_fd else 0x0F)).astype(np.uint8)
-        self._alive[offset] = (self._alive[offset] + len(rows)) & 0xFF
 
     def _send(self, arbitration_id: int, rows: Rows) -> None:
         payload, size = rows.tobytes(), rows.itemsize
