@@ -24,8 +24,8 @@ from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
 from eqrt.runtime.decoding.ego_messages import EgoDecoder
 from eqrt.runtime.decoding.ego_profile import EgoProfile
 from eqrt.runtime.decoding.geodesy import MapOrigin
-from eqrt.runtime.decoding.objects import ObjectDecoder
 from eqrt.runtime.decoding.message_check import MessageCheck, message_check
+from eqrt.runtime.decoding.objects import ObjectDecoder
 from eqrt.runtime.decoding.profile import Profile
 from eqrt.runtime.decoding.sensor_profile import SensorProfile
 from eqrt.runtime.protection.sequence import Status
@@ -67,7 +67,8 @@ class Decoder:
         accepted = _accepted_channels(profile, channels)
         origin = None if map_origin_deg is None else MapOrigin(*map(math.radians, map_origin_deg))
         self._egos = [_EgoInput(ego, origin, self.counters) for ego in profile.ego]
-        for source in (*self._sensors, *self._egos):
+        self._sources: list[_SensorInput | _EgoInput] = [*self._sensors, *self._egos]
+        for source in self._sources:
             for address, take in source.inputs():
                 check = message_check(address, self.counters, source.profile.silence_s)
                 route = _Route(address, accepted[source.profile.bus], take, check, self.counters)
@@ -79,7 +80,7 @@ class Decoder:
 
         As of the last `feed` or `poll`: silence shows only when time passes.
         """
-        return tuple(source.health.report for source in (*self._sensors, *self._egos))
+        return tuple(source.health.report for source in self._sources)
 
     def feed(self, message: can.Message, timestamp_s: float) -> list[Event]:
         """What this message completes; mostly nothing. The list is not to be changed."""
@@ -147,7 +148,9 @@ class _Route:
         if self._check is None:
             return self._take(data, timestamp_s, _OK)
         status = self._check.status(data, timestamp_s)
-        return self._take(data if status.is_usable else _UNREADABLE, timestamp_s, status)
+        if status is not _OK and not status.is_usable:
+            data = _UNREADABLE
+        return self._take(data, timestamp_s, status)
 
 
 class _SensorInput:
@@ -230,9 +233,7 @@ class _EgoInput:
         for i, part in enumerate(self.profile.parts):
             yield part.address, partial(self._add, i)
 
-    def _add(
-        self, part: int, data: Payload, timestamp_s: float, status: Status
-    ) -> Sequence[Event]:
+    def _add(self, part: int, data: Payload, timestamp_s: float, status: Status) -> Sequence[Event]:
         events = self._decoder.add(part, data, timestamp_s)
         valid = self.health.judge(status is _OK, timestamp_s, part)
         if valid or not events:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.decoding.checksums import Check, Checksum, E2eCheck, sum8, xor8
 from eqrt.runtime.decoding.dbc_files import DbcMessage
@@ -39,7 +41,7 @@ def bind_checksum(
         combine=combine or crc_of(8 * size, *_crc_numbers(table, size, where)),
         byte=-size if table.byte is None else table.byte,
         size=size,
-        order=table.order or "little",
+        order=table.order,
         covers_id=table.covers_id,
         covers_length=table.covers_length,
     )
@@ -65,10 +67,12 @@ def counter_signal(check: E2eCheck) -> Signal:
 
 def _check_keys(table: ChecksumTable, where: str) -> None:
     known = _KEYS[table.kind]
-    for key in sorted({key for keys in _KEYS.values() for key in keys} - set(known)):
-        if getattr(table, key) not in (None, False):
+    for field in fields(table):
+        is_given = getattr(table, field.name) != field.default
+        if is_given and field.name not in ("kind", *known):
             raise ProfileError(
-                f"{where}: {key} does not go with kind = {table.kind!r}; {', '.join(known)} do"
+                f"{where}: {field.name} does not go with kind = {table.kind!r}; "
+                f"{', '.join(known)} do"
             )
 
 
@@ -83,9 +87,7 @@ def _crc_numbers(table: ChecksumTable, size: int, where: str) -> list[int]:
     return numbers
 
 
-def _e2e(
-    table: ChecksumTable, message: DbcMessage, arbitration_id: int, where: str
-) -> E2eCheck:
+def _e2e(table: ChecksumTable, message: DbcMessage, arbitration_id: int, where: str) -> E2eCheck:
     data_id = data_id_of(arbitration_id) if table.data_id is None else table.data_id
     offset = 0 if table.offset is None else table.offset
     if not 0 <= data_id <= 0xFFFF:

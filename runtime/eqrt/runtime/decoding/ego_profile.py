@@ -79,7 +79,13 @@ def bind_ego(table: EgoTable, dbc: Dbc, id_offset: int, where: str) -> EgoProfil
     valid = fields.valid and binder.condition("fields.valid", fields.valid)
     id_offset += table.arbitration_id_offset
     parts = [
-        _part(messages[name], spec, binder, i, id_offset, f"{where}.messages.{name}")
+        _part(
+            messages[name],
+            spec,
+            binder.columns(i),
+            id_offset=id_offset,
+            where=f"{where}.messages.{name}",
+        )
         for i, (name, spec) in enumerate(specs.items())
     ]
     return EgoProfile(
@@ -98,12 +104,11 @@ def bind_ego(table: EgoTable, dbc: Dbc, id_offset: int, where: str) -> EgoProfil
 def _part(
     message: DbcMessage,
     spec: EgoMessageTable,
-    binder: Binder,
-    index: int,
+    columns: list[Column],
+    *,
     id_offset: int,
     where: str,
 ) -> EgoPart:
-    columns = binder.columns(index)
     counter = None
     if spec.counter is not None:
         counter = Binder(where, {"": [message]}).signal("counter", spec.counter)

@@ -61,7 +61,7 @@ class ChecksumTable:
 
     kind: Literal["sum8", "xor8", "crc8", "crc16", "e2e-p5"]
     byte: int | None = None
-    order: Literal["little", "big"] | None = None
+    order: Literal["little", "big"] = "little"
     covers_id: bool = False
     covers_length: bool = False
     polynomial: int | None = None

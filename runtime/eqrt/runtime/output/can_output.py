@@ -40,9 +40,9 @@ class Offset(IntEnum):
     POINT_CLASSIC = 5
 
 
-# The fields of a message in their order on the wire, without gaps. `alive` and then `crc` are left
-# to whoever sends, who calls `protect`; in the classic messages `alive` is the low half of its byte,
-# and the high half is used as well.
+# The fields of a message in their order on the wire, without gaps. `alive` and `crc` are for
+# `protect`, last of all; in the classic messages `alive` is the low half of its byte, and the high
+# half is used as well.
 STATUS = np.dtype(
     [
         ("crc", "<u2"),

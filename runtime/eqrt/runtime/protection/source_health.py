@@ -62,7 +62,7 @@ class SourceHealth:
         self._silence_s = silence_s
         self._parts = [_Streak() for _ in range(num_parts)]
         self._heard_s: float | None = None
-        self._state = SourceState.WAITING
+        self._state, self._is_valid = SourceState.WAITING, False
         self._since_s: float | None = None
         self._right = self._wrong = self._silences = self._refused = 0
 
@@ -80,20 +80,19 @@ class SourceHealth:
         )
 
     def judge(self, right: bool, now_s: float, part: int = -1) -> bool:
-        """Take a verdict; whether the source is valid with it."""
+        """Take a verdict on something of a part; whether the source is valid with it."""
         silent = self.expire(now_s)
-        self._parts[part].add(right)
+        streak = self._parts[part]
         self._right += right
         self._wrong += not right
-        if part in (-1, len(self._parts) - 1):
+        if streak is self._parts[-1]:
             self._heard_s, silent = now_s, False
-        if self._heard_s is None or silent:
-            return False
-        if all(streak.is_good for streak in self._parts):
-            self._become(SourceState.VALID, now_s)
-        elif self._state is not SourceState.WAITING or self._is_hopeless:
-            self._become(SourceState.WRONG, now_s)
-        return self._state is SourceState.VALID
+        if self._is_valid and right and streak.is_settled:  # as nearly always
+            return True
+        streak.add(right)
+        if self._heard_s is not None and not silent:
+            self._conclude(now_s)
+        return self._is_valid
 
     def refuse(self) -> None:
         """Count what is not used because the source is not valid."""
@@ -110,24 +109,29 @@ class SourceHealth:
             self._become(SourceState.SILENT, now_s)
         return True
 
-    @property
-    def _is_hopeless(self) -> bool:
-        return any(streak.wrong >= MAX_WRONG for streak in self._parts)
+    def _conclude(self, now_s: float) -> None:
+        if all(streak.is_good for streak in self._parts):
+            self._become(SourceState.VALID, now_s)
+        elif self._state is not SourceState.WAITING or any(
+            streak.wrong >= MAX_WRONG for streak in self._parts
+        ):
+            self._become(SourceState.WRONG, now_s)
 
     def _become(self, state: SourceState, now_s: float) -> None:
         if state is not self._state:
             self._state, self._since_s = state, now_s
+            self._is_valid = state is SourceState.VALID
 
 
 class _Streak:
     """Verdicts in a row. What was never judged is as good as what was right."""
 
     def __init__(self) -> None:
-        self.wrong = 0
-        """In a row, up to now."""
+        self.wrong = 0  # in a row, up to now
         self._missing = 0  # right ones, until it is good
         self._needed = 1  # of them, after a wrong one: the first right one will do at the start
         self._is_new = True
+        self.is_settled = False  # right ones change nothing
 
     @property
     def is_good(self) -> bool:
@@ -144,3 +148,4 @@ class _Streak:
             if self.wrong >= MAX_WRONG or self._missing or self._is_new:
                 self._missing = self._needed
         self._is_new = False
+        self.is_settled = right and self.is_good
