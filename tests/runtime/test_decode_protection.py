@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import random
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import can
+import cantools.database
 import numpy as np
 import pytest
+from e2e import p05
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -30,6 +35,7 @@ from eqrt.runtime.protection.source_health import (
     SourceReport,
     SourceState,
 )
+from source_tree import ROOT
 from tiny_sensor import (
     COUNTED,
     FIRST,
@@ -44,6 +50,8 @@ from tiny_sensor import (
     second,
 )
 
+DECODING = ROOT / "runtime/eqrt/runtime/decoding"
+DBCS, E2E_TOML = DECODING / "dbc", DECODING / "profiles" / "generic-e2e.toml"
 E2E = load_profile("generic-e2e")
 CARS = [Car(object_id=i + 1, x_m=10.0 * i, y_m=3.0 * i, speed_mps=1.0) for i in range(3)]
 HEADER, POSITION, MOTION, EGO_MOTION, EGO_YAW = 0x5AB, 0x5AC, 0x5AD, 0x5A8, 0x5AA
@@ -163,7 +171,7 @@ class TestProtectedList:
         assert report_of(decoder, "ego EGO_MOTION").valid
 
     def test_all_ids_and_data_ids_move_with_the_offset(self, tmp_path: Path) -> None:
-        text = (E2E_TOML).read_text()
+        text = E2E_TOML.read_text()
         profile = profile_of(
             tmp_path, text.replace("arbitration_id_offset = 0 ", "arbitration_id_offset = 16 ")
         )
@@ -178,14 +186,41 @@ class TestProtectedList:
         assert isinstance(detections, Detections)
         assert len(detections.object_id) == len(CARS)
 
+    def test_the_page_about_profiles_says_how_to_send_it(self) -> None:
+        """Its example protects as we do, and as the E2E library of somebody else checks."""
+        text = (ROOT / "docs" / "profiles.md").read_text()
+        (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+        names: dict[str, Any] = {}
+        exec(example, names)
+        counters: Counter[int] = Counter()
+        for one in (one for cycle in sent(100) for one in cycle):
+            count = counters[one.arbitration_id]
+            assert names["protect"](bytes(one.data[4:]), one.arbitration_id, count) == one.data
+            assert p05.e2e_p05_check(one.data, one.arbitration_id)
+            counters[one.arbitration_id] += 1
+        assert max(counters.values()) == 300
+
+    def test_the_dbc_is_the_plain_one_behind_a_header(self) -> None:
+        """As cantools reads both."""
+        plain: Any = cantools.database.load_file(DBCS / "eqrt_objects.dbc")
+        protected: Any = cantools.database.load_file(DBCS / "eqrt_objects_e2e.dbc")
+        for theirs, ours in zip(plain.messages, protected.messages, strict=True):
+            assert (ours.name, ours.frame_id) == (theirs.name, theirs.frame_id + 8)
+            assert (ours.length, ours.is_fd) == (12, True)
+            crc, counter, *signals = ours.signals
+            assert (crc.start, crc.length, counter.start, counter.length) == (0, 16, 16, 8)
+            assert crc.comment
+            assert counter.comment
+            for other, signal in zip(theirs.signals, signals, strict=True):
+                assert signal.start == other.start + 32
+                for key in ("name", "length", "is_signed", "scale", "unit", "choices", "comment"):
+                    assert getattr(signal, key) == getattr(other, key), signal.name
+
     def test_a_longer_message_counts_as_far_as_the_dbc_goes(self) -> None:
         (cycle,) = sent(1)
         for one in cycle:
             one.data = one.data + b"\xff" * 4
         assert len(feed_all(Decoder(E2E), cycle)) == 3
-
-
-E2E_TOML = Path(load_profile.__code__.co_filename).parent / "profiles" / "generic-e2e.toml"
 
 
 class TestWhatOneFaultCosts:

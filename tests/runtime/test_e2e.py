@@ -125,6 +125,34 @@ def test_every_flipped_bit_is_found(protection: Protection, length: int) -> None
             assert Checker(protection).check(damaged) is Status.ERROR
 
 
+@pytest.mark.parametrize("length", [64, 32, 12, 8])
+def test_every_three_flipped_bits_are_found(length: int) -> None:
+    """A CRC is linear: what flipped bits do to it is the exclusive or of what each of them does.
+
+    In profile 2 the bits of the counter choose the data id as well, and are left out.
+    """
+    data = bytearray(length)
+    protection = P2 if length == 8 else P5
+    protection.protect(data, 0)
+    kept = range(8, 12) if protection is P2 else range(0)
+    effects = []
+    for bit in set(range(8 * length)) - set(kept):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        again = bytearray(flipped)
+        protection.protect(again, 0 if protection is P2 else flipped[2])
+        size = 1 if protection is P2 else 2
+        effects.append(
+            int.from_bytes(flipped[:size], "little") ^ int.from_bytes(again[:size], "little")
+        )
+    one = np.array(effects)
+    first, second = np.triu_indices(len(one), 1)
+    two = one[first] ^ one[second]
+    assert one.all()
+    assert two.all()
+    assert not np.isin(two, one).any()
+
+
 @pytest.mark.parametrize(("protection", "length", "width"), [(P5, 64, 16), (P2, 8, 8)])
 def test_every_burst_no_longer_than_the_check_is_found(
     protection: Protection, length: int, width: int

@@ -36,6 +36,7 @@ from source_tree import ROOT
 
 DBC = ROOT / "runtime/eqrt/runtime/output/eqrt.dbc"
 ENCODING_BUDGET_S = 0.001  # p99 for 32 objects on the reference machine (2 cores)
+PROTECTION_BUDGET_S = 0.0003  # likewise, for counters and checks
 NOT_AVAILABLE = "NOT_AVAILABLE"
 CHANNELS = (f"publish-{number}" for number in itertools.count())
 
@@ -389,3 +390,18 @@ def test_32_objects_are_encoded_within_the_budget(is_fd: bool, benchmark: Any) -
     benchmark.pedantic(encode, rounds=500, warmup_rounds=20)
     if benchmark.enabled:
         assert np.quantile(benchmark.stats.stats.data, 0.99) < ENCODING_BUDGET_S
+
+
+@pytest.mark.parametrize("is_fd", [True, False])
+def test_the_checks_of_32_objects_are_computed_within_the_budget(
+    is_fd: bool, benchmark: Any
+) -> None:
+    messages = encode_fd(many(32), 1) if is_fd else encode_classic(many(32))
+
+    def protect_all() -> None:
+        for offset, rows in messages:
+            protect(rows, BASE_ID + offset, 0)
+
+    benchmark.pedantic(protect_all, rounds=500, warmup_rounds=20)
+    if benchmark.enabled:
+        assert np.quantile(benchmark.stats.stats.data, 0.99) < PROTECTION_BUDGET_S

@@ -148,7 +148,7 @@ class Checker:
     """Checks the messages of one id, in the order in which they come."""
 
     def __init__(self, protection: Protection, *, max_delta: int | None = None) -> None:
-        """`max_delta`: AUTOSAR's MaxDeltaCounter; None = half the range of the counter."""
+        """`max_delta`: AUTOSAR's MaxDeltaCounter; None = less than half the counter's range."""
         self._protection = protection
         self._sequence = Sequence(protection.modulus, max_delta=max_delta)
 
