@@ -69,10 +69,11 @@ def test_it_says_why_and_since_when() -> None:
     health = SourceHealth("radar", 0.5)
     assert (health.report.state, health.report.since_s) == (SourceState.WAITING, None)
     assert not health.report.valid
+    assert health.report.reason == "nothing right has come yet"
     assert not health.expire(99.0)  # what has never come is not silent
     judged([True] * 3, health)
     assert (health.report.state, health.report.since_s) == (SourceState.VALID, 0.0)
-    assert health.report.valid
+    assert (health.report.valid, health.report.reason) == (True, "")
     for i in range(MAX_WRONG):
         health.judge(False, 0.3 + i * STEP_S)
     health.refuse()

@@ -39,8 +39,8 @@ class Sequence:
         """The counter goes from 0 to `modulus` - 1.
 
         `max_delta` (AUTOSAR's MaxDeltaCounter): how far it may be from the last one; None = less
-        than half its range, beyond which a gap looks like a step back. After more than `silence_s` without
-        a message any counter will do: the sender may have started again.
+        than half its range, beyond which a gap looks like a step back. After more than `silence_s`
+        without a message any counter will do: the sender may have started again.
         """
         self._modulus = modulus
         self._max_delta = (modulus - 1) // 2 if max_delta is None else max_delta

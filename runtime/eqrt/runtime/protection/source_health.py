@@ -52,6 +52,11 @@ class SourceReport:
         """Whether what it says is used."""
         return self.state is SourceState.VALID
 
+    @property
+    def reason(self) -> str:
+        """Why it is not valid; empty if it is."""
+        return "" if self.valid else self.state.value
+
 
 class SourceHealth:
     """Takes a verdict on all that comes from a source, and the time."""
