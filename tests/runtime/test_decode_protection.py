@@ -423,20 +423,20 @@ class TestPipeline:
         return said
 
     def test_without_a_believable_ego_nothing_is_predicted(self) -> None:
-        cycles = sent(40)
-        for i in range(10, 30):
+        cycles = sent(60)
+        for i in range(20, 40):
             cycles[i] = changed(cycles[i], lambda one: [damaged(one)], EGO_MOTION, EGO_YAW)
         said = self.modes(cycles)
-        assert said[5:10] == [(Mode.NO_MAP, 3)] * 5
-        assert said[20:30] == [(Mode.NO_POSE, 0)] * 10
+        assert said[15:20] == [(Mode.NO_MAP, 3)] * 5
+        assert said[30:40] == [(Mode.NO_POSE, 0)] * 10
         assert said[-5:] == [(Mode.NO_MAP, 3)] * 5
 
     def test_without_a_believable_sensor_silence_is_said(self) -> None:
-        cycles = sent(40)
-        for i in range(10, 30):
+        cycles = sent(60)
+        for i in range(20, 40):
             cycles[i] = changed(cycles[i], lambda one: [damaged(one)], POSITION, MOTION)
         said = self.modes(cycles)
-        assert said[5:10] == [(Mode.NO_MAP, 3)] * 5
+        assert said[15:20] == [(Mode.NO_MAP, 3)] * 5
         assert said.count((Mode.SILENT, 0)) >= 10
         assert said[-5:] == [(Mode.NO_MAP, 3)] * 5
 
