@@ -7,15 +7,16 @@ import contextlib
 import gc
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from queue import Empty, Queue
-
-import can
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.bus.channels import parse_channels
+from eqrt.runtime.bus.health import in_sum, trouble
+from eqrt.runtime.bus.ids import Ids
+from eqrt.runtime.bus.links import opener
+from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import Profile, builtin_profiles, load_profile
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS, DatagramPublisher
 from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher
@@ -23,12 +24,11 @@ from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.prediction.tiles import load_tile
-from eqrt.runtime.service import Observer, Publisher, Receiver, Service
+from eqrt.runtime.service import Observer, Publisher, Service
 from eqrt.runtime.signals import until_told_to_stop
 from eqrt.runtime.status_book import status_line
 
 NO_CHANNEL = "none"
-_NOTICE_END_S = 0.1  # how often a thread of python-can looks whether it is to end
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,6 +82,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="HOST:PORT",
         help="send predictions as UDP datagrams too, to a viewer or recorder, such as "
         f"{DEFAULT_ADDRESS} (repeatable)",
+    )
+    parser.add_argument(
+        "--wait-for-bus",
+        action="store_true",
+        help="at the start, wait for channels that are not there yet, or down (default: an error); "
+        "one that is lost later is waited for in any case",
     )
     parser.add_argument("--quiet", action="store_true", help="no status line every second")
 
@@ -149,96 +155,42 @@ def run(args: argparse.Namespace) -> int:
     channels = parse_channels(args.can, profile.roles)
     with contextlib.ExitStack() as stack:
         should_stop = stack.enter_context(until_told_to_stop())
-        buses = _open_buses(args, profile, sorted(set(channels.values())), stack)
-        several = channels if len(buses) > 1 else None
+        heard = sorted(set(channels.values()))
+        receiver = stack.enter_context(_receiver(args, profile, heard))
+        several = channels if len(heard) > 1 else None
         pipeline = load_pipeline(args, profile, several, clock=time.monotonic)
-        publishers = _publishers(args, buses, stack)
-        service = Service(
-            pipeline, _receiver(buses, stack), publishers, _observers(args, publishers)
-        )
+        publishers = _publishers(args, receiver, stack)
+        observers = _observers(args, publishers, receiver)
+        service = Service(pipeline, receiver, publishers, observers)
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
-        print(f"eqrt serve: {profile.name} on {', '.join(buses)}; Ctrl-C ends", flush=True)
+        print(f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends", flush=True)
         service.run(should_stop)
-    print(f"eqrt serve: {_summary(pipeline)}")
+        troubles = in_sum(receiver.health())
+    print(f"eqrt serve: {_summary(pipeline)}" + (f"; {troubles}" if troubles else ""))
     return 0
 
 
-def _open_buses(
-    args: argparse.Namespace, profile: Profile, channels: list[str], stack: contextlib.ExitStack
-) -> dict[str, can.BusABC]:
-    return {
-        channel: stack.enter_context(
-            open_bus(channel, args.can_interface, fd=args.fd, receive_ids=profile.arbitration_ids)
-        )
-        for channel in channels
-    }
+def _receiver(args: argparse.Namespace, profile: Profile, channels: Sequence[str]) -> Receiver:
+    """Reads `channels`, and opens the one that predictions go to, if it is another, for sending."""
+    wanted: dict[str, Ids | None] = dict.fromkeys(channels, profile.ids)
+    if (out := _out_channel(args)) is not None:
+        wanted.setdefault(out, ())
+    return Receiver(opener(args.can_interface, fd=args.fd), wanted, _warn, wait=args.wait_for_bus)
 
 
-def _receiver(buses: Mapping[str, can.BusABC], stack: contextlib.ExitStack) -> Receiver:
-    """One bus is read directly; several, in python-can's threads."""
-    if len(buses) == 1:
-        return next(iter(buses.values()))
-    return stack.enter_context(Merged(buses))
-
-
-class Merged:
-    """Several buses read as one, each by a thread of python-can's."""
-
-    def __init__(self, buses: Mapping[str, can.BusABC]) -> None:
-        # Not SimpleQueue: up to Python 3.12, a signal late in its wait makes the wait endless.
-        self._heard: Queue[can.Message | Exception] = Queue()
-        self._notifiers = [
-            can.Notifier(bus, [_Ear(channel, self._heard)], timeout=_NOTICE_END_S)
-            for channel, bus in buses.items()
-        ]
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next message of any bus; its channel is the name that the bus was opened by.
-
-        Raises can.CanOperationError if a bus can no longer be read.
-        """
-        try:
-            heard = self._heard.get(timeout=timeout)
-        except Empty:
-            return None
-        if isinstance(heard, Exception):
-            raise can.CanOperationError(str(heard)) from heard
-        return heard
-
-    def __enter__(self) -> Merged:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for notifier in self._notifiers:
-            notifier.stop()
-
-
-class _Ear(can.Listener):
-    """Puts what a bus's thread hears where the main thread reads."""
-
-    def __init__(self, channel: str, heard: Queue[can.Message | Exception]) -> None:
-        self._channel = channel
-        self._heard = heard
-
-    def on_message_received(self, msg: can.Message) -> None:
-        msg.channel = self._channel  # some interfaces keep the sender's name for it
-        self._heard.put(msg)
-
-    def on_error(self, exc: Exception) -> None:
-        self._heard.put(exc)
+def _out_channel(args: argparse.Namespace) -> str | None:
+    """Where predictions go on CAN; None = nowhere."""
+    if args.out_can == NO_CHANNEL:
+        return None
+    return str(args.out_can or args.can[0].rpartition("=")[2])
 
 
 def _publishers(
-    args: argparse.Namespace, buses: dict[str, can.BusABC], stack: contextlib.ExitStack
+    args: argparse.Namespace, receiver: Receiver, stack: contextlib.ExitStack
 ) -> list[Publisher]:
     publishers: list[Publisher] = []
-    if args.out_can != NO_CHANNEL:
-        channel = args.out_can or args.can[0].rpartition("=")[2]
-        bus = buses.get(channel)
-        if bus is None:
-            bus = stack.enter_context(
-                open_bus(channel, args.can_interface, fd=args.fd, receive_ids=[])
-            )
+    if (out := _out_channel(args)) is not None:
+        bus = receiver.connection(out)
         publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
     elif not args.datagrams:
         raise UsageError("--out-can none and no --datagrams: the predictions would go nowhere")
@@ -247,14 +199,32 @@ def _publishers(
     return publishers
 
 
-def _observers(args: argparse.Namespace, publishers: Sequence[Publisher]) -> list[Observer]:
-    observers: list[Observer] = [] if args.quiet else [_say]
+def _observers(
+    args: argparse.Namespace, publishers: Sequence[Publisher], receiver: Receiver
+) -> list[Observer]:
+    observers: list[Observer] = [] if args.quiet else [_Terminal(receiver).say]
     observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
     return observers
 
 
-def _say(status: ServiceStatus) -> None:
-    print(f"{time.strftime('%H:%M:%S')} {status_line(status)}", flush=True)
+class _Terminal:
+    """A line every second: how the service is, and what is wrong with its channels."""
+
+    def __init__(self, receiver: Receiver) -> None:
+        self._receiver = receiver
+        self._before = receiver.health()
+
+    def say(self, status: ServiceStatus) -> None:
+        """With what has happened to the channels since the last line."""
+        health = self._receiver.health()
+        text = trouble(self._before, health, time.monotonic())
+        self._before = health
+        line = status_line(status) + (f"  {text}" if text else "")
+        print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)
+
+
+def _warn(line: str) -> None:
+    print(f"eqrt serve: {line}", file=sys.stderr, flush=True)
 
 
 def _summary(pipeline: Pipeline) -> str:
