@@ -25,6 +25,9 @@ class Receiver(Protocol):
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next message, or None after `timeout` seconds; never raises."""
 
+    def counts(self) -> dict[str, int]:
+        """What happened to the channels since the start, by name."""
+
 
 class Clock(Protocol):
     """The pipeline's time while serving."""
@@ -64,7 +67,7 @@ class Service:
         self._publishers = publishers
         self._observers = observers
         self._clock = clock or ArrivalClock()
-        self._book = StatusBook(pipeline, publishers)
+        self._book = StatusBook(pipeline, [receiver, *publishers])
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Serve until told to stop."""

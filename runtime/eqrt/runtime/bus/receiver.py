@@ -13,7 +13,7 @@ from operator import attrgetter
 import can
 
 from eqrt.runtime.bus.connection import Connection
-from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.bus.health import BusHealth, BusState
 from eqrt.runtime.bus.ids import Ids
 from eqrt.runtime.bus.links import OpenLink
 
@@ -79,6 +79,19 @@ class Receiver:
     def health(self) -> list[BusHealth]:
         """How every channel is now, in the order in which they were given."""
         return [connection.health() for connection in self._connections.values()]
+
+    def counts(self) -> dict[str, int]:
+        """Of all channels together, by name; `bus_not_up` is how many are not, now."""
+        health = self.health()
+        return {
+            "bus_not_up": sum(one.state is not BusState.UP for one in health),
+            "bus_losses": sum(one.losses for one in health),
+            "bus_reconnects": sum(one.reconnects for one in health),
+            "bus_offs": sum(one.bus_offs for one in health),
+            "bus_error_frames": sum(one.error_frames for one in health),
+            "bus_dropped": sum(one.dropped or 0 for one in health),
+            "bus_overruns": sum(one.overruns for one in health),
+        }
 
     def shutdown(self) -> None:
         """Close every channel."""

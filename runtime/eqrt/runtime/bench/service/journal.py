@@ -95,6 +95,10 @@ class NotingReceiver:
             self._journal.had(message)
         return message
 
+    def counts(self) -> dict[str, int]:
+        """As the receiver's own."""
+        return self._receiver.counts()
+
 
 class NotingPublisher:
     """A publisher whose predictions are noted."""
