@@ -40,6 +40,15 @@ STATUS = re.compile(
 SUMMARY = re.compile(r"eqrt serve: (\d+) messages, (\d+) cycles, (\d+) predictions")
 
 
+@dataclass(frozen=True)
+class Buses:
+    """Where the messages go, and where the predictions."""
+
+    channel: str
+    out_channel: str
+    interface: str = LOCAL
+
+
 @dataclass
 class Outcome:
     """What happened to the messages."""
@@ -87,37 +96,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--stall", type=float, default=0.0, help="seconds for which the service is held up"
     )
     args = parser.parse_args(arguments)
+    buses = Buses(args.can, args.out_can, args.interface)
     outcomes = []
     for rate_hz in args.rate or [4000.0, 10_000.0]:
         outcomes.append(
-            load(
-                rate_hz,
-                args.seconds,
-                objects=args.objects,
-                channel=args.can,
-                out_channel=args.out_can,
-                interface=args.interface,
-                stall_s=args.stall,
-            )
+            load(buses, rate_hz, args.seconds, objects=args.objects, stall_s=args.stall)
         )
         print(outcomes[-1].line(), flush=True)
     return int(any(one.sent != one.read for one in outcomes))
 
 
 def load(
-    rate_hz: float,
-    seconds: float,
-    *,
-    objects: int,
-    channel: str,
-    out_channel: str,
-    interface: str,
-    stall_s: float = 0.0,
+    buses: Buses, rate_hz: float, seconds: float, *, objects: int, stall_s: float = 0.0
 ) -> Outcome:
     """Load a service of its own, held up meanwhile; its predictions go to the other channel."""
     outcome = Outcome(rate_hz)
     cycles = traffic(rate_hz, objects)
-    options = ["--can", channel, "--out-can", out_channel, "--can-interface", interface]
+    options = ["--can", buses.channel, "--out-can", buses.out_channel]
+    options += ["--can-interface", buses.interface]
     service = subprocess.Popen(
         [*EQRT, "serve", *options, "--profile", PROFILE, "--tile", str(TILE)],
         stdout=subprocess.PIPE,
@@ -129,7 +125,7 @@ def load(
         if not service.stdout.readline():  # what it says when it is ready
             raise RuntimeError("the service did not start")
         with (
-            contextlib.closing(Sender(channel, interface)) as sender,
+            contextlib.closing(Sender(buses)) as sender,
             stalled(service.pid, stall_s),
         ):
             send(sender, cycles, rate_hz, seconds, outcome)
@@ -142,7 +138,7 @@ def load(
     finally:
         service.kill()
         service.wait()
-    conclude(rest.splitlines()[-1], channel, outcome)
+    conclude(rest.splitlines()[-1], buses.channel, outcome)
     return outcome
 
 
@@ -187,8 +183,8 @@ def stalled(pid: int, seconds: float) -> Iterator[None]:
 class Sender:
     """A place on the bus that only sends."""
 
-    def __init__(self, channel: str, interface: str) -> None:
-        self._link = open_link(channel, interface, fd=None, receive=())
+    def __init__(self, buses: Buses) -> None:
+        self._link = open_link(buses.channel, buses.interface, fd=None, receive=())
         self.close = self._link.shutdown
 
     def put(self, message: can.Message) -> None:

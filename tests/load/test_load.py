@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 import time
 
-from eqrt.runtime.bus.buses import LOCAL
-from load.run import load
+from load.run import Buses, load
 
 
-def channels(name: str) -> dict[str, str]:
+def buses(name: str) -> Buses:
     unique = f"{name}-{os.getpid()}-{time.monotonic_ns()}"
-    return {"channel": unique, "out_channel": f"{unique}-out", "interface": LOCAL}
+    return Buses(unique, f"{unique}-out")
 
 
 def test_a_full_bus_is_read_to_the_last_message() -> None:
-    found = load(1000.0, 3.0, objects=10, **channels("full"))
+    found = load(buses("full"), 1000.0, 3.0, objects=10)
     assert (found.sent, found.read, found.lost) == (3000, 3000, 0)
     assert found.predicted > 100
     assert "lost" not in found.summary
@@ -23,7 +22,7 @@ def test_a_full_bus_is_read_to_the_last_message() -> None:
 
 def test_what_a_held_up_service_loses_is_counted_by_the_kernel_and_said() -> None:
     """To the message, while it goes on with those that it has."""
-    found = load(15_000.0, 3.0, objects=10, stall_s=2.0, **channels("stall"))
+    found = load(buses("stall"), 15_000.0, 3.0, objects=10, stall_s=2.0)
     assert found.sent == 45_000
     assert found.lost > 0
     assert found.read > 100

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import re
 import signal
 import time
 from collections import defaultdict
@@ -272,9 +273,11 @@ def test_garbage_on_the_bus_is_counted_and_skipped() -> None:
         status, stdout, stderr = service.end(signal.SIGTERM)
     assert (status, stderr) == (0, "")
     summary = stdout.splitlines()[-1]
-    unusable = int(summary.split()[-2])
-    assert summary.endswith(" unusable")
+    found = re.search(r" (\d+) unusable; \S+: (\d+) error frames", summary)
+    assert found, summary
+    unusable, error_frames = map(int, found.groups())
     assert unusable > len(lines)
+    assert error_frames == len(lines)
     cycles = by_cycle(heard.messages)
     assert len(cycles) > 5
     assert sum(len(rows) for _, rows in cycles) > 5

@@ -38,15 +38,13 @@ def predictions(log: str) -> int:
     filters: list[can.typechecking.CanFilter] = [{"can_id": STATUS, "can_mask": 0x7FF}]
     with can.Bus(CHANNEL, "socketcan", fd=True, can_filters=filters) as bus:
         subprocess.run([*EQRT, "play", log, "--can", CHANNEL], check=True, capture_output=True)
-        is_silent = False
-        told = []
+        is_silent, told = False, 0
         while not is_silent:
             message = bus.recv(PATIENCE_S)
             assert message is not None
-            is_silent = bool(told) and message.data[MODE_BYTE] == SILENT
-            if message.data[NUM_OBJECTS_BYTE]:
-                told.append(message)
-        return len(told)
+            is_silent = told > 0 and message.data[MODE_BYTE] == SILENT
+            told += message.data[NUM_OBJECTS_BYTE] > 0
+        return told
 
 
 def main(log: str) -> dict[str, object]:
