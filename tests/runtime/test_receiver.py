@@ -170,6 +170,23 @@ def test_messages_that_find_the_queue_full_are_counted_exactly() -> None:
     assert 0 < counted[0] == counted[1] < counted[2]
 
 
+def test_each_message_tells_how_many_were_lost_before_it() -> None:
+    """Which is all that kernels before 4.12 say."""
+    channel = next(CHANNELS)
+    with open_bus(channel, LOCAL) as bus, open_bus(channel, LOCAL) as sender:
+        assert isinstance(bus, LocalBus)
+        bus._receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
+        reader, sent, received = bus.batches(None), 0, 0
+        for flood in (10, 2000, 1):
+            for i in range(flood):
+                sender.send(number(i))
+            sent += flood
+            while messages := reader.read():
+                received += len(messages)
+                assert all(0.0 <= time.time() - message.timestamp < 5.0 for message in messages)
+        assert reader._queue._drops == sent - received > 0
+
+
 def test_a_queue_is_made_larger_and_never_smaller() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as small:
         before = small.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
