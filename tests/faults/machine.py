@@ -22,6 +22,8 @@ from drives import Car, object_list, shipped_predictor
 from eqrt.core.frames import Pose2
 from eqrt.core.scene import Scene
 from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.bus.links import opener
+from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.datagrams import DatagramPublisher
@@ -252,11 +254,11 @@ def served_in_a_thread(channel: str, heard: Heard) -> Iterator[tuple[int, Hangin
     model, over = Hanging(), threading.Event()
     profile = load_profile("generic")
     with (
-        open_bus(channel, LOCAL, receive_ids=profile.arbitration_ids) as bus,
+        Receiver(opener(LOCAL, fd=None), {channel: profile.ids}, print) as receiver,
         DatagramPublisher([heard.address]) as publisher,
     ):
         pipeline = Pipeline(profile, model, clock=time.monotonic)
-        service = Service(pipeline, bus, [publisher])
+        service = Service(pipeline, receiver, [publisher])
         thread = threading.Thread(target=service.run, args=(over.is_set,))
         thread.start()
         yield os.getpid(), model

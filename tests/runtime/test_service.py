@@ -18,6 +18,7 @@ import pytest
 from drives import DRIVES, first_seconds, shipped_predictor
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.bus.health import BusHealth
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import load_profile
@@ -126,6 +127,9 @@ class Queue:
         time.sleep(timeout or 0.0)
         return None
 
+    def health(self) -> list[BusHealth]:
+        return []
+
     def counts(self) -> dict[str, int]:
         return {"left": len(self.messages)}
 
@@ -190,6 +194,15 @@ def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> 
     assert last.totals["decoder_messages"] == first.messages + last.messages
     assert last.totals["said"] == last.totals["pipeline_cycles"] > first.totals["said"] > 0
     assert (last.totals["bus_losses"], last.totals["bus_dropped"]) == (0, 0)
+    (bus,) = last.buses
+    assert (bus.channel, bus.state, bus.losses, bus.overflow) == (channel, "UP", 0, 0)
+    assert 2.0 <= bus.since_s < 60.0
+    assert [one.name for one in last.sources] == [
+        "ars408",
+        "ego SpeedInformation",
+        "ego YawRateInformation",
+    ]
+    assert all(one.valid and not one.reason and one.since_s > 0.0 for one in last.sources)
     assert set(first.stages_s) == {"tracks", "scene", "infer", "guard"}
 
 
@@ -198,7 +211,7 @@ def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> 
 
 def book(pipeline: Pipeline, forecasts: Iterable[ForecastSet]) -> StatusBook:
     """Of a service that has said these, each 12 ms after its last message came."""
-    found = StatusBook(pipeline, [])
+    found = StatusBook(pipeline, Queue(0.1), [])
     for forecast in forecasts:
         found.published(forecast, time.monotonic() - 0.012)
         pipeline.counters.cycles += 1

@@ -40,8 +40,8 @@ SHED_PERIODS = 0.7
 """Of the model's period, counted from the arrival of a cycle's last message: what could not be
 predicted by then is left to physics, so that the rest leaves in time and nothing queues up."""
 MAX_INPUT_AGE_S = 1.0
-"""Input that is older when it comes is not used: sensors may say how old their measurements are, and
-a bit that is flipped there must not undo everything that came since."""
+"""Input that is older when it comes is not used: sensors may say how old their measurements are,
+and a bit that is flipped there must not undo everything that came since."""
 SILENT_PERIODS = 3
 """After this many model steps without a prediction, everything said before is void."""
 _FINISH_S = 1.0  # longer than any profile's timeout

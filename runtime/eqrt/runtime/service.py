@@ -12,21 +12,18 @@ import can
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.status_book import StatusBook
+from eqrt.runtime.status_book import Channels, StatusBook
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly
 _REPORT_S = 1.0
 MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but a wall clock that was set
 
 
-class Receiver(Protocol):
+class Receiver(Channels, Protocol):
     """Where messages come from: channels that may be lost and come back, while it goes on."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next message, or None after `timeout` seconds; never raises."""
-
-    def counts(self) -> dict[str, int]:
-        """What happened to the channels since the start, by name."""
 
 
 class Clock(Protocol):
@@ -67,7 +64,7 @@ class Service:
         self._publishers = publishers
         self._observers = observers
         self._clock = clock or ArrivalClock()
-        self._book = StatusBook(pipeline, [receiver, *publishers])
+        self._book = StatusBook(pipeline, receiver, publishers)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Serve until told to stop."""
