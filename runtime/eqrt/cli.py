@@ -20,6 +20,7 @@ COMMANDS = {
     "demo": ("eqrt.runtime.demo.command", "see it work: recorded traffic, predicted and scored"),
     "serve": ("eqrt.runtime.serve", "predict from a CAN bus, publish on CAN and as datagrams"),
     "play": ("eqrt.runtime.play", "put a recorded log on a CAN bus"),
+    "can": ("eqrt.runtime.can_check.command", "check a sensor's profile against a recorded log"),
     "replay": ("eqrt.runtime.replay", "run the service on a recorded log, offline, repeatably"),
     "replay-fleet": (
         "eqrt.export.replay_fleet",
