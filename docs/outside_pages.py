@@ -52,7 +52,7 @@ def _fitted(link: re.Match[str], place: str) -> str:
     if not (ROOT / found).exists():
         raise FileNotFoundError(f"{_in_repository(place)} links to {target}, which is not there")
     if (in_site := _in_site(found)) is None:
-        return text if found in text or text.startswith("`") else f"{text} (`{found}`)"
+        return text if posixpath.basename(found) in text else f"{text} (`{found}`)"
     relative = posixpath.relpath(in_site, posixpath.dirname(place) or ".")
     return f"{mark}[{text}]({relative}{hash_sign}{anchor})"
 

@@ -33,6 +33,9 @@ NOT_RUN = (
     NotRun(r"deploy/README", r"journalctl ", "needs systemd"),
     NotRun(r"deploy/README", r"docker ", "needs docker and a network"),
     NotRun(r"deploy/examples/README", r"", "`make conformance` runs this page, command by command"),
+    NotRun(r"benchmarks", r"eqrt bench( --service)?$", "README.md has the same"),
+    NotRun(r"benchmarks", r"eqrt bench --json ", "start-budget.md has the same"),
+    NotRun(r"benchmarks", r"eqrt bench --compare", "a minute; test_side_by_side.py runs it"),
     NotRun(r"training", r"torchrun ", "tests/training/test_ranks.py runs two processes"),
     NotRun(r"model", r"eqrt simulate acosta", "SUMO's Bologna scenarios are not in the repository"),
     NotRun(r"evaluation", r"eqrt eval .* --scheduler ", "needs a cluster; see test_evaluation.py"),
@@ -93,6 +96,7 @@ CHANGES = (
     Change(
         r"^eqrt bench --service", r"$", " --seconds 1 --objects 1", "a second instead of minutes"
     ),
+    Change(r"^eqrt eval .*--jobs 8", r"--jobs 8", "--jobs 2", "two small files need no more"),
     Change(r"^eqrt plot ", r"--worst 12 --sample 12", "--worst 1 --sample 1", "two pictures"),
 )
 

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from processes import PATIENCE_S
 from source_tree import ROOT, SOURCE_ROOTS
 
 _WARM = ["eqrt.cli", "eqrt.export.command", "eqrt.export.evaluation.command", "eqrt.training.train"]
+PATIENCE_S = 300.0  # for one command, on a machine that does much else
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(_WARM)
 

@@ -36,9 +36,9 @@ def build(folder: Path) -> Path:
     _write_recordings(folder)
     _write_drive(folder)
     _write_maps(folder)
-    for name in ("ARTIFACT", "DIR", "A", "B"):
+    for name in ("ARTIFACT", "DIR", "A"):
         (folder / name).symlink_to(DEFAULT_ARTIFACT)
-    (folder / "C").symlink_to(ROOT / "deploy/models/eqrt-small-6")
+    (folder / "B").symlink_to(ROOT / "deploy/models/eqrt-small-6")
     return folder
 
 
