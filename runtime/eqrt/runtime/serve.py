@@ -24,6 +24,9 @@ from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.recording.options import add_record_arguments, start_recorder
+from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.steps import TapedClock
 from eqrt.runtime.service import Observer, Publisher, Service
 from eqrt.runtime.signals import until_told_to_stop
 from eqrt.runtime.status_book import status_line
@@ -90,6 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "one that is lost later is waited for in any case",
     )
     parser.add_argument("--quiet", action="store_true", help="no status line every second")
+    add_record_arguments(parser)
 
 
 def _arbitration_id(text: str) -> int:
@@ -158,10 +162,15 @@ def run(args: argparse.Namespace) -> int:
         heard = sorted(set(channels.values()))
         receiver = stack.enter_context(_receiver(args, profile, heard))
         several = channels if len(heard) > 1 else None
-        pipeline = load_pipeline(args, profile, several, clock=time.monotonic)
+        clock = TapedClock(time.monotonic) if args.record else None
+        pipeline = load_pipeline(args, profile, several, clock=clock or time.monotonic)
         publishers = _publishers(args, receiver, stack)
+        recorder = None
+        if clock:
+            recorder = stack.enter_context(start_recorder(args, pipeline, several, clock))
+            publishers.append(recorder)
         observers = _observers(args, publishers, receiver)
-        service = Service(pipeline, receiver, publishers, observers)
+        service = Service(pipeline, receiver, publishers, observers, witness=recorder)
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
         print(f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends", flush=True)
         service.run(should_stop)
@@ -192,8 +201,8 @@ def _publishers(
     if (out := _out_channel(args)) is not None:
         bus = receiver.connection(out)
         publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
-    elif not args.datagrams:
-        raise UsageError("--out-can none and no --datagrams: the predictions would go nowhere")
+    elif not args.datagrams and not args.record:
+        raise UsageError("--out-can none, no --datagrams, no --record: predictions go nowhere")
     if args.datagrams:
         publishers.append(stack.enter_context(DatagramPublisher(args.datagrams)))
     return publishers
@@ -203,7 +212,7 @@ def _observers(
     args: argparse.Namespace, publishers: Sequence[Publisher], receiver: Receiver
 ) -> list[Observer]:
     observers: list[Observer] = [] if args.quiet else [_Terminal(receiver).say]
-    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
+    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher | Recorder)]
     return observers
 
 
