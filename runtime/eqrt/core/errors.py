@@ -38,3 +38,7 @@ class AbsentBusError(BusError):
 
 class LogError(EqrtError):
     """A recorded log cannot be read."""
+
+
+class RecordingError(EqrtError):
+    """A recording cannot be written."""

@@ -104,21 +104,27 @@ def _arbitration_id(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r} is not a CAN id such as 0x6e0") from error
 
 
-def add_pipeline_arguments(parser: argparse.ArgumentParser) -> None:
-    """What `serve` and `replay` have in common."""
+def add_pipeline_arguments(parser: argparse.ArgumentParser, *, of_recordings: bool = False) -> None:
+    """What `serve` and `replay` have in common.
+
+    `of_recordings`: where input may be a recording, which says itself what it was made with;
+    profile and model are None if not given.
+    """
+    recorded = "; a recording has its own" if of_recordings else ""
     parser.add_argument(
         "--profile",
-        required=True,
+        required=not of_recordings,
         metavar="NAME|FILE",
         help=f"which sensor sends: {', '.join(builtin_profiles())}, or a profile of your own, "
-        "a .toml file (docs/profiles.md)",
+        f"a .toml file (docs/profiles.md){recorded}",
     )
     parser.add_argument(
         "--model",
         type=Path,
-        default=DEFAULT_ARTIFACT,
+        default=None if of_recordings else DEFAULT_ARTIFACT,
         metavar="FOLDER",
-        help="the predictor, as `eqrt export` writes it (default: the one that comes with eqrt)",
+        help="the predictor, as `eqrt export` writes it (default: the one that comes with eqrt"
+        f"{recorded})",
     )
     parser.add_argument(
         "--tile",
