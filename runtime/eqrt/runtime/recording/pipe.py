@@ -37,7 +37,7 @@ class PipeEnd:
         self._waiting.append(memoryview(piece))
         self.waiting_bytes += len(piece)
         self.push()
-        return True
+        return self.is_open
 
     def push(self) -> None:
         """Send what the pipe takes now."""

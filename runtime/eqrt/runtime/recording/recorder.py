@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -49,8 +50,14 @@ class Recorder:
         self._due_s = time.monotonic() + _BATCH_S
         self._sent_bytes = 0
         self._dropped = 0
+        self._is_said = False
         self._writer, self._pipe = _started(max_waiting_bytes)
         self._offer(_MSGPACK.encode(order))
+
+    @property
+    def writer_pid(self) -> int:
+        """The process that writes."""
+        return self._writer.pid
 
     # --- a witness of every step
 
@@ -91,6 +98,8 @@ class Recorder:
         """Send what has gathered, if there is room for it."""
         self._due_s = time.monotonic() + _BATCH_S
         self._pipe.push()
+        if not self._pipe.is_open:
+            self._say_if_killed()
         if not self._batch:
             return
         batch, size = self._batch, self._batch_bytes
@@ -118,6 +127,18 @@ class Recorder:
         self.close()
 
     # ---
+
+    def _say_if_killed(self) -> None:
+        """Once; a writer that ended by itself has said why."""
+        code = self._writer.poll()
+        if code is not None and code < 0 and not self._is_said:
+            self._is_said = True
+            print(
+                f"eqrt serve: recording ended: its writer was killed ({signal.Signals(-code).name})"
+                "; predictions go on",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def _put_clock(self) -> None:
         if said_s := self._clock.take():
