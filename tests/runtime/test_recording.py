@@ -16,7 +16,6 @@ import mcap.reader
 import numpy as np
 import pytest
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Schema
 
 from drives import DRIVES, Car, first_seconds, shipped_predictor, traffic
 from eqrt.cli import main
@@ -93,7 +92,7 @@ def said(recording: Recording) -> bytes:
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Heard]]:
-    """NGSIM with its tile, and the RAV4 on two channels: folder of the recording, what was heard."""
+    """NGSIM with its tile, the RAV4 on two channels: where it was recorded, what was heard."""
     found = {}
     for name in ("ngsim", "rav4"):
         folder = tmp_path_factory.mktemp(name)
@@ -237,9 +236,8 @@ def newest_by_the_library(file: Path) -> int:
     with file.open("rb") as stream:
         reader = mcap.reader.NonSeekingReader(stream)
         with contextlib.suppress(McapError, ValueError):
-            found: Iterator[tuple[Schema | None, Channel, Message]]
-            for found in iter(reader.iter_messages(log_time_order=False)):
-                newest_ns = max(newest_ns, found[2].log_time)
+            for _, _, message in reader.iter_messages(log_time_order=False):
+                newest_ns = max(newest_ns, message.log_time)
     return newest_ns
 
 
@@ -373,6 +371,9 @@ class Traffic:
 
 class Paced:
     """The pipeline's time is the traffic's."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
 
     def now_s(self, monotonic_s: float, stamp_s: float | None, wall_s: float) -> float:
         del monotonic_s, wall_s

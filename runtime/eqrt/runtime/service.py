@@ -69,6 +69,7 @@ class Service:
         publishers: Sequence[Publisher],
         observers: Sequence[Observer] = (),
         clock: Clock | None = None,
+        *,
         witness: Witness | None = None,
     ) -> None:
         """`clock`: None = when messages arrive."""

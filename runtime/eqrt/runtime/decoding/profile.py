@@ -107,7 +107,7 @@ def profile_files(name_or_path: str) -> dict[str, bytes]:
     """
     path = _path(name_or_path)
     table = read_toml(path, ProfileTable)
-    names = sorted({part.dbc for part in (*table.sensor, *table.ego)})
+    names = sorted({s.dbc for s in table.sensor} | {ego.dbc for ego in table.ego})
     try:
         dbcs = {name: _dbc_path(name, path).read_bytes() for name in names}
         return {path.name: path.read_bytes()} | dbcs

@@ -32,7 +32,9 @@ def decode_forecasts(payload: bytes) -> ForecastSet:
     """The cycle in the bytes; ValueError if they are not what `encode_forecasts` writes."""
     try:
         plain = _DECODER.decode(payload)
-        values = {name: _array(*v) if _is_array(v) else v for name, v in plain.items()}
+        values: dict[str, Any] = {
+            name: _array(*v) if _is_array(v) else v for name, v in plain.items()
+        }
         values["mode"] = Mode(values["mode"])
         values["map_from_ego"] = Pose2(*plain["map_from_ego"])
         return ForecastSet(**values)

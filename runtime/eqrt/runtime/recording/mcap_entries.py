@@ -51,9 +51,7 @@ def read_head(stream: IO[bytes], where: str) -> Head:
     return Head(identity, attached)
 
 
-def read_entries(
-    stream: IO[bytes], where: str, end_early: Callable[[str], None]
-) -> Iterator[Raw]:
+def read_entries(stream: IO[bytes], where: str, end_early: Callable[[str], None]) -> Iterator[Raw]:
     """Every entry; `end_early` is told what was wrong if the file ends before its time.
 
     Raises LogError if it is no recording of eqrt.

@@ -8,13 +8,12 @@ import secrets
 from collections.abc import Mapping
 from pathlib import Path
 
-import msgspec
-
 from eqrt.core.errors import RecordingError
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.recording.folder import free_bytes, total_bytes
 from eqrt.runtime.recording.identity import attached_files, identity_of
+from eqrt.runtime.recording.json_schemas import json_schema
 from eqrt.runtime.recording.order import Order
 from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.steps import Lost, TapedClock
@@ -93,8 +92,8 @@ def start_recorder(
         identity=identity,
         attached=attached_files(args.profile, pipeline),
         schemas={
-            NAMES[Topic.STATUS]: _schema(ServiceStatus),
-            NAMES[Topic.LOST]: _schema(Lost),
+            NAMES[Topic.STATUS]: json_schema(ServiceStatus),
+            NAMES[Topic.LOST]: json_schema(Lost),
         },
         file_bytes=args.record_file_size,
         file_seconds=_FILE_SECONDS,
@@ -132,11 +131,3 @@ def _check(args: argparse.Namespace) -> None:
             f"{args.record_limit / 1e9:.2f} (--record-limit); delete some, or give "
             "--record-when-full delete-oldest"
         )
-
-
-def _schema(kind: type) -> bytes:
-    """JSON schema, its top level an object with properties, which viewers want."""
-    (schema,), components = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
-    definitions = dict(components)
-    top = definitions.pop(schema["$ref"].rpartition("/")[2])
-    return msgspec.json.encode(top | {"$defs": definitions})

@@ -111,7 +111,7 @@ def _inside(name: str, recording: Recording) -> PurePosixPath:
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or not path.parts:
         raise LogError(
-            f"{recording.paths[0]}: a file in it is named {name!r}, which leads elsewhere; give the "
-            "profile with --profile"
+            f"{recording.paths[0]}: a file in it is named {name!r}, which leads elsewhere; give "
+            "the profile with --profile"
         )
     return path

@@ -63,7 +63,7 @@ def can_entry(message: can.Message, now_s: float) -> CanEntry:
         message.timestamp,
         message.arbitration_id,
         bytes(message.data),
-        message.channel,
+        _name(message.channel),
         message.is_extended_id,
         message.is_remote_frame,
         message.is_error_frame,
@@ -73,6 +73,10 @@ def can_entry(message: can.Message, now_s: float) -> CanEntry:
         message.error_state_indicator,
         message.dlc if message.is_remote_frame else -1,
     )
+
+
+def _name(channel: can.typechecking.Channel | None) -> str | int | None:
+    return channel if channel is None or isinstance(channel, str | int) else str(channel)
 
 
 def can_message(entry: CanEntry) -> can.Message:

@@ -154,7 +154,7 @@ class _Recording:
         self._file.flush()
         self._make_room()
         order = self._order
-        if self._file.bytes >= order.file_bytes or self._file.age_s >= order.file_seconds:
+        if self._file.size >= order.file_bytes or self._file.age_s >= order.file_seconds:
             self.close()
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ class _File:
         return time.monotonic() - self._begun_s
 
     @property
-    def bytes(self) -> int:
+    def size(self) -> int:
         return self._stream.tell()
 
     def add(self, batch: bytes) -> None:
