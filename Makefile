@@ -62,7 +62,7 @@ PIP_INSTALL = -m pip install -qq --disable-pip-version-check --constraint constr
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(call create_environment,$(VENV),the workstation: torch and linters)
 	@$(VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
-	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps,data,scale,sim]' --group dev
+	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps,data,scale,sim,bridges]' --group dev
 	@touch $@
 
 $(RUNTIME_VENV)/.installed: pyproject.toml constraints.txt

@@ -108,15 +108,17 @@ def _opened(chunk: Any) -> list[Any]:
 
     if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
         raise ValueError(f"{chunk.uncompressed_size} bytes in a chunk")
-    return list(breakup_chunk(chunk, validate_crc=True))
+    try:
+        return list(breakup_chunk(chunk, validate_crc=True))
+    except Exception as error:  # whatever the library, or what unpacks for it, stumbles over
+        raise ValueError(_reason(error)) from error
 
 
 def _damages() -> tuple[type[Exception], ...]:
     """What the libraries raise on bytes that are not as they should be."""
-    import zstandard  # noqa: PLC0415 (see _records)
-    from mcap.exceptions import McapError  # noqa: PLC0415
+    from mcap.exceptions import McapError  # noqa: PLC0415 (see _records)
 
-    return (McapError, struct.error, ValueError, zstandard.ZstdError, MemoryError)
+    return (McapError, struct.error, ValueError, MemoryError)
 
 
 def _reason(error: Exception) -> str:
