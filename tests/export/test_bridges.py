@@ -23,6 +23,7 @@ from eqrt.cli import main
 from eqrt.export.bridges.moments import Moment
 from eqrt.export.bridges.ros2 import PREDICTED_OBJECTS, TOPIC, autoware_types, moved_on
 from eqrt.runtime.bus.candump import candump_line, candump_message
+from eqrt.runtime.bus.health import BusHealth
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.json_lines import json_lines
@@ -40,6 +41,16 @@ from forecast_sets import one_car
 from source_tree import ROOT
 
 NGSIM = DRIVES["ngsim"]
+
+
+class Nowhere:
+    """No bus."""
+
+    def health(self) -> list[BusHealth]:
+        return []
+
+    def counts(self) -> dict[str, int]:
+        return {}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +75,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         delete_oldest=False,
     )
     with Recorder(order, clock) as recorder:
-        book = StatusBook(pipeline, [recorder])
+        book = StatusBook(pipeline, Nowhere(), [recorder])
         for line in first_seconds(NGSIM.log, 2.0).splitlines():
             message = candump_message(line)
             now_s = message.timestamp

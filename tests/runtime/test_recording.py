@@ -21,6 +21,7 @@ from drives import DRIVES, Car, first_seconds, shipped_predictor, traffic
 from eqrt.cli import main
 from eqrt.core.errors import LogError, RecordingError
 from eqrt.runtime.bus.buses import LOCAL
+from eqrt.runtime.bus.health import BusHealth
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
@@ -367,6 +368,12 @@ class Traffic:
         message = next(self._messages, None)
         self.is_over = message is None
         return message
+
+    def health(self) -> list[BusHealth]:
+        return []
+
+    def counts(self) -> dict[str, int]:
+        return {}
 
 
 class Paced:
