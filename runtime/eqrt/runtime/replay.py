@@ -26,7 +26,7 @@ from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.recording.reader import is_recording, read_recordings
 from eqrt.runtime.recording.replaying import Instead, recorded_pipeline, replay_recording
 from eqrt.runtime.recording.steps import ReplayedClock
@@ -188,7 +188,9 @@ class _RecordingReplay:
         for recording in self._recordings:
             clock = ReplayedClock()
             pipeline = recorded_pipeline(recording, self._instead(), clock)
-            if (notice := pipeline.predictor.license_notice) not in notices:
+            model = pipeline.predictor
+            notice = model.license_notice if isinstance(model, Predictor) else None
+            if notice not in notices:
                 print(f"eqrt: {notice}", file=sys.stderr)
                 notices.add(notice)
             self._pipelines.append(pipeline)

@@ -116,6 +116,9 @@ class Recorder:
     def close(self) -> None:
         """Send the rest and wait for the writer, but not for ever; leaving `with` does it too."""
         self.flush()
+        if any(self._lost.values()):  # it is noted, too, if there is room before the end
+            self._pipe.drain(_END_S)
+            self._offer(self._lost_entry())
         self._pipe.close(_END_S)
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._writer.wait(_END_S)
