@@ -69,6 +69,10 @@ class Serving:
         assert self.ready.startswith("eqrt serve: "), self.end()
         return self
 
+    def send(self, number: signal.Signals) -> None:
+        """A signal."""
+        self._process.send_signal(number)
+
     def end(self, by: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
         """Tell it to end: exit status, the rest of its output, its errors."""
         self._process.send_signal(by)

@@ -1,6 +1,7 @@
 """`make soak`: a day and more of traffic, and whether anything grows, is missed or goes wrong.
 
-    python -m soak.run [--simulated-hours 24] [--simulated-objects 8] [--real-hours 1] [--objects 32]
+    python -m soak.run [--simulated-hours 24] [--simulated-objects 8]
+                       [--real-hours 1] [--objects 32]
 
 Simulated: the pipeline, its encoders and its status on a virtual clock, as fast as the machine can.
 Real: `eqrt serve` beside a process that sends ten object lists a second. Memory is resident size
