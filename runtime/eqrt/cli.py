@@ -34,6 +34,11 @@ COMMANDS = {
         "eqrt.export.bridges.convert",
         "turn a recording into Foxglove, ROS 2, candump or JSON files (extra: bridges)",
     ),
+    "view": (
+        "eqrt.runtime.view.command",
+        "watch the service, or a recorded file, in a browser (extra: view)",
+    ),
+    "top": ("eqrt.runtime.view.top", "watch the service in a terminal (extra: view)"),
     "tile": ("eqrt.runtime.tile_command", "look at a map tile, or build one"),
     "prepare": ("eqrt.export.prepare", "cut recordings into training windows (extra: train)"),
     "simulate": ("eqrt.training.simulation.command", "record traffic driven by SUMO (extra: sim)"),
@@ -75,7 +80,9 @@ EXTRA_OF = {  # third-party module -> the extra that brings it
     "foxglove_schemas_protobuf": "bridges",
     "google": "bridges",
     "rosbags": "bridges",
+    "websockets": "view",
 }
+_EXTRA_OF_COMMAND = {"view": "view", "top": "view"}  # for packages that come with several extras
 
 
 class Parser(argparse.ArgumentParser):
@@ -117,6 +124,7 @@ def command_module(name: str) -> ModuleType:
         extra = EXTRA_OF.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
+        extra = _EXTRA_OF_COMMAND.get(name, extra)
         raise missing_extra(f"eqrt {name}", error.name or "", extra) from error
 
 

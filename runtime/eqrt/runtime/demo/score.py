@@ -42,11 +42,12 @@ class Scored:
 class Scoreboard:
     """Running displacement errors of one stream of predictions."""
 
-    def __init__(self) -> None:
+    def __init__(self, keep: int | None = None) -> None:
+        """`keep`: how many of the newest predictions `tables` speaks of; None = of all."""
         self._places: dict[int, _Places] = {}
         self._pending: deque[ForecastSet] = deque()
-        self._model: list[Float64] = []
-        self._baseline: list[Float64] = []
+        self._model: deque[Float64] = deque(maxlen=keep)
+        self._baseline: deque[Float64] = deque(maxlen=keep)
         self._dt_s = 0.1
 
     def add(self, forecast: ForecastSet) -> list[Scored]:
@@ -66,7 +67,7 @@ class Scoreboard:
 
     @property
     def count(self) -> int:
-        """Predictions scored so far."""
+        """Predictions scored so far, of those kept."""
         return len(self._model)
 
     def tables(self) -> tuple[dict[str, float], dict[str, float]]:
@@ -102,8 +103,8 @@ class _Places:
     """Where one track was measured."""
 
     def __init__(self) -> None:
-        self._times_s: list[float] = []
-        self._positions: list[Float64] = []
+        self._times_s: deque[float] = deque()
+        self._positions: deque[Float64] = deque()
 
     @property
     def newest_s(self) -> float:
@@ -114,6 +115,9 @@ class _Places:
         if not self._times_s or time_s > self._times_s[-1]:
             self._times_s.append(time_s)
             self._positions.append(position)
+        while self._times_s[0] < self._times_s[-1] - _FORGET_S:
+            self._times_s.popleft()
+            self._positions.popleft()
 
     def at(self, times_s: Float64) -> Float64 | None:
         """Positions (n, 2) at `times_s` (n,); None if one of them is not between measurements."""

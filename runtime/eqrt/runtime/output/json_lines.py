@@ -14,7 +14,7 @@ _MILLI, _MICRO = 1_000.0, 1_000_000.0
 _ENCODER = msgspec.json.Encoder()
 
 
-class _Line(msgspec.Struct):
+class Line(msgspec.Struct):
     """The keys of a line, in their order. Metres and m/s in the map frame, seconds."""
 
     cycle: int
@@ -56,7 +56,7 @@ def json_lines(forecasts: ForecastSet) -> bytes:
         _rounded(forecasts.trajectories, _MILLI),
         strict=True,
     )
-    return b"".join(_ENCODER.encode(_Line(*cycle, *values)) + b"\n" for values in columns)
+    return b"".join(_ENCODER.encode(Line(*cycle, *values)) + b"\n" for values in columns)
 
 
 def _rounded(values: NDArray[np.float64], steps_per_unit: float) -> list[Any]:

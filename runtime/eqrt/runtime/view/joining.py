@@ -1,0 +1,48 @@
+"""Datagrams to whole cycles: the parts of a cycle put together, and what was missed, counted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from eqrt.runtime.output.datagrams import Datagram
+from eqrt.runtime.output.forecasts import ForecastSet
+
+
+class Joiner:
+    """Takes datagrams in the order in which they come."""
+
+    def __init__(self) -> None:
+        self._parts: list[Datagram] = []
+        self._cycle = -1
+        self.lost_cycles = 0
+        """Cycles of which nothing, or not everything, came."""
+
+    def add(self, datagram: Datagram) -> ForecastSet | None:
+        """The whole cycle, if this was its last part."""
+        cycle = datagram.forecasts.cycle
+        if self._parts and self._parts[0].forecasts.cycle != cycle:
+            self.lost_cycles += 1
+            self._parts = []
+        if not self._parts and self._cycle >= 0:  # a service that started again counts from 0
+            self.lost_cycles += max(0, cycle - self._cycle - 1)
+        self._cycle = cycle
+        self._parts.append(datagram)
+        if len(self._parts) < datagram.parts:
+            return None
+        parts, self._parts = self._parts, []
+        return joined([part.forecasts for part in parts])
+
+
+def joined(parts: Sequence[ForecastSet]) -> ForecastSet:
+    """One cycle from some of its targets each."""
+    if len(parts) == 1:
+        return parts[0]
+    arrays = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(ForecastSet)
+        if isinstance(getattr(parts[0], field.name), np.ndarray)
+    }
+    return replace(parts[0], **arrays)

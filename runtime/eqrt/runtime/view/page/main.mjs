@@ -1,0 +1,333 @@
+// The page: what comes in, what is shown, what keys and buttons do.
+
+import { Camera } from "./camera.mjs";
+import { set, showBanner, showScore, showSelected, showService } from "./panels.mjs";
+import { Scene, egoAt } from "./scene.mjs";
+import { showSigns } from "./signs.mjs";
+import { openStream } from "./stream.mjs";
+import { FileTimeline, LiveTimeline } from "./timeline.mjs";
+import { decodeLanes, decodeUpdate } from "./update.mjs";
+
+const PANELS_MS = 250;
+const KEPT_STATUSES = 70;
+const by = (id) => document.getElementById(id);
+const seconds = () => performance.now() / 1000;
+
+const camera = new Camera();
+const scene = new Scene(by("scene"));
+const page = {
+  timeline: new LiveTimeline(),
+  hello: null,
+  connected: false,
+  opened: seconds(),
+  statuses: [],
+  trouble: "",
+  moment: null,
+  selected: null,
+  yaw: null,
+  words: "",
+  frames: 0,
+  scriptMs: [],
+  frameTimes: [],
+};
+
+const stream = openStream({
+  state: (connected) => {
+    page.connected = connected;
+    page.opened = seconds();
+  },
+  text: hear,
+  update: (buffer) => page.timeline.add(decodeUpdate(buffer), seconds()),
+});
+
+function hear(message) {
+  const { timeline } = page;
+  switch (message.kind) {
+    case "hello":
+      greet(message);
+      break;
+    case "lanes":
+      scene.lanes = decodeLanes(message);
+      if (timeline.mode === "file") timeline.lanes = message.number;
+      break;
+    case "status":
+      if (message.time_s < (page.statuses.at(-1)?.time_s ?? 0)) page.statuses = [];
+      page.statuses.push(message);
+      if (page.statuses.length > KEPT_STATUSES) page.statuses.shift();
+      break;
+    case "index":
+      timeline.index(message);
+      if (message.statuses.length) page.statuses = message.statuses;
+      break;
+    case "trouble":
+      page.trouble = message.words;
+      break;
+    default: // of a newer server
+  }
+}
+
+function greet(message) {
+  page.hello = message;
+  if (message.mode === "file" && page.timeline.mode !== "file") {
+    page.timeline = new FileTimeline((wanted) => stream.ask(wanted));
+    by("speed").hidden = false;
+  }
+  set("live", message.mode === "file" ? "To end" : "Live");
+}
+
+// Pictures
+
+let last = seconds();
+
+function picture() {
+  requestAnimationFrame(picture);
+  const began = performance.now();
+  const now = began / 1000;
+  page.moment = page.timeline.moment(now, Math.min(0.1, now - last));
+  last = now;
+  if (page.moment) aim(page.moment);
+  const time = page.moment?.cycle.time_s ?? 0;
+  scene.draw(page.moment, camera, page.selected, (back) => page.timeline.near(time - back));
+  page.frames += 1;
+  remember(page.frameTimes, began);
+  remember(page.scriptMs, performance.now() - began);
+}
+
+function remember(list, value) {
+  list.push(value);
+  if (list.length > 600) list.shift();
+}
+
+/** Where the camera looks at this moment. */
+function aim(moment) {
+  const ego = egoAt(moment);
+  if (ego) page.yaw = ego[2];
+  let at = ego;
+  const row = moment.cycle.rows.get(page.selected);
+  if (camera.follow === "selected" && row !== undefined) at = agentPlace(moment, row);
+  if (!at && camera.follow === "ego" && !camera.placed) at = middleOf(moment.cycle);
+  camera.placed = Boolean(at) || camera.placed;
+  const [x, y] = at ?? [camera.x, camera.y];
+  camera.lookAt(x, y, page.yaw);
+}
+
+function agentPlace({ cycle, next, part }, row) {
+  const place = (of, at) => [
+    of.origin[0] + of.position[2 * at] * of.step_m, of.origin[1] + of.position[2 * at + 1] * of.step_m,
+  ];
+  const [x, y] = place(cycle, row);
+  const later = next?.rows.get(cycle.agents.track_id[row]);
+  if (later === undefined) return [x, y];
+  const [nx, ny] = place(next, later);
+  return [x + part * (nx - x), y + part * (ny - y)];
+}
+
+/** Of a file that does not tell where the ego vehicle is: its traffic. */
+function middleOf(cycle) {
+  return cycle.count ? cycle.origin : null;
+}
+
+// Panels
+
+function panels() {
+  const { timeline, moment } = page;
+  const now = seconds();
+  const silent = timeline.mode === "live" && timeline.live && !timeline.empty ? now - timeline.arrived : 0;
+  page.words = showBanner({
+    connected: page.connected, hello: page.hello, moment, silent,
+    status: page.statuses.at(-1), waiting: now - page.opened,
+  });
+  showService(page.statuses, moment, page.trouble ? [page.trouble] : [], scene.colours);
+  showScore(moment?.cycle.score ?? null);
+  showSelected(moment, page.selected);
+  showTransport(timeline);
+}
+
+function showTransport(timeline) {
+  set("play", timeline.playing ? "Pause" : "Play");
+  by("live").classList.toggle("now", timeline.live);
+  for (const id of ["play", "back", "forward", "scrub", "live"]) by(id).disabled = timeline.empty;
+  if (timeline.empty) return set("when", "");
+  const span = timeline.last - timeline.first;
+  if (document.activeElement !== by("scrub") || timeline.playing) {
+    by("scrub").value = span ? (1000 * (timeline.time - timeline.first)) / span : 1000;
+  }
+  return set("when", when(timeline));
+}
+
+function when(timeline) {
+  if (timeline.mode === "file") {
+    return `${clock(timeline.time - timeline.first)} of ${clock(timeline.last - timeline.first)}${timeline.done ? "" : " …"}`;
+  }
+  if (timeline.live) return `live, ${timeline.delay.toFixed(2)} s ago`;
+  return `${(timeline.last - timeline.time).toFixed(1)} s ago`;
+}
+
+function clock(time) {
+  const minutes = Math.floor(time / 60);
+  return `${minutes}:${(time - 60 * minutes).toFixed(1).padStart(4, "0")}`;
+}
+
+// What a person does
+
+const actions = {
+  pause: () => (page.timeline.playing ? page.timeline.pause() : page.timeline.play()),
+  back: () => page.timeline.step(-1),
+  forward: () => page.timeline.step(1),
+  backSecond: () => page.timeline.step(-10),
+  forwardSecond: () => page.timeline.step(10),
+  live: () => page.timeline.goLive(),
+  closer: () => camera.zoom(1.25),
+  farther: () => camera.zoom(0.8),
+  turn: () => {
+    camera.headingUp = !camera.headingUp;
+    set("turn", camera.headingUp ? "Heading up" : "North up");
+  },
+  follow: () => follow(nextToFollow()),
+  ghosts: () => {
+    scene.ghosts = !scene.ghosts;
+    by("ghosts").setAttribute("aria-pressed", scene.ghosts);
+  },
+  help: () => (by("help").open ? by("help").close() : by("help").showModal()),
+  unselect: () => select(null),
+  next: () => select(neighbour(1)),
+  previous: () => select(neighbour(-1)),
+};
+
+const keys = {
+  " ": "pause", p: "pause", ArrowLeft: "back", ArrowRight: "forward", l: "live", End: "live",
+  "+": "closer", "=": "closer", "-": "farther", n: "turn", f: "follow", g: "ghosts", "?": "help",
+  Escape: "unselect",
+};
+
+function nextToFollow() {
+  if (camera.follow === "free") return "ego";
+  if (camera.follow === "ego" && page.selected !== null) return "selected";
+  return camera.follow === "ego" ? "free" : "ego";
+}
+
+function follow(whom) {
+  if (camera.follow !== whom && whom === "free") camera.pan(0, 0);
+  camera.follow = whom;
+  camera.placed = false;
+  const words = { ego: "Following ego", selected: "Following selected", free: "Not following" };
+  set("follow", words[whom]);
+}
+
+function select(id) {
+  page.selected = id;
+  if (id === null && camera.follow === "selected") follow("ego");
+  panels();
+}
+
+/** The next agent by distance from the ego vehicle. */
+function neighbour(step) {
+  const agents = page.moment?.cycle.agents;
+  if (!agents?.track_id.length) return null;
+  const order = agents.track_id.map((id, row) => [agents.range_m[row] ?? id, id]).sort((a, b) => a[0] - b[0]);
+  const at = order.findIndex(([, id]) => id === page.selected);
+  return order[(at + step + order.length) % order.length][1];
+}
+
+function act(name) {
+  actions[name]();
+  panels();
+}
+
+addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || by("help").open) return;
+  const inScrub = event.target === by("scrub") || event.target === by("speed");
+  if (inScrub && event.key.startsWith("Arrow")) return;
+  let name = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (event.shiftKey && (name === "back" || name === "forward")) name += "Second";
+  if (event.key === "Tab" && event.target === by("scene") && page.selected !== null) {
+    name = event.shiftKey ? "previous" : "next";
+  }
+  if (event.key === "Enter" && event.target === by("scene")) name = "next";
+  if (!name || (event.target.tagName === "BUTTON" && (event.key === " "))) return;
+  event.preventDefault();
+  act(name);
+});
+
+const buttons = {
+  play: "pause", back: "back", forward: "forward", live: "live", "zoom-in": "closer",
+  "zoom-out": "farther", turn: "turn", follow: "follow", ghosts: "ghosts", "help-button": "help",
+  unselect: "unselect",
+};
+for (const [id, name] of Object.entries(buttons)) by(id).onclick = () => act(name);
+
+by("scrub").oninput = () => {
+  const { timeline } = page;
+  if (timeline.mode === "live" && timeline.playing) timeline.pause();
+  timeline.seek(timeline.first + (by("scrub").value / 1000) * (timeline.last - timeline.first));
+  panels();
+};
+by("speed").onchange = () => (page.timeline.speed = Number(by("speed").value));
+
+const canvas = by("scene");
+let drag = null;
+canvas.onpointerdown = (event) => {
+  canvas.setPointerCapture(event.pointerId);
+  drag = { x: event.offsetX, y: event.offsetY, moved: 0 };
+};
+canvas.onpointermove = (event) => {
+  if (!drag) {
+    canvas.classList.toggle("hit", scene.hit(event.offsetX, event.offsetY) !== null);
+    return;
+  }
+  const [dx, dy] = [event.offsetX - drag.x, event.offsetY - drag.y];
+  drag.moved += Math.abs(dx) + Math.abs(dy);
+  if (drag.moved > 4) {
+    camera.pan(dx, dy);
+    set("follow", "Not following");
+    canvas.classList.add("dragging");
+  }
+  [drag.x, drag.y] = [event.offsetX, event.offsetY];
+};
+canvas.onpointerup = (event) => {
+  if (drag && drag.moved <= 4) select(scene.hit(event.offsetX, event.offsetY)?.id ?? null);
+  drag = null;
+  canvas.classList.remove("dragging");
+};
+canvas.onpointercancel = () => (drag = null);
+canvas.onwheel = (event) => {
+  event.preventDefault();
+  camera.zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
+};
+
+function dress() {
+  scene.readColours();
+  showSigns(by("signs"), scene.colours);
+}
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", dress);
+new ResizeObserver(() => scene.resize(camera)).observe(canvas);
+
+scene.resize(camera);
+dress();
+setInterval(panels, PANELS_MS);
+panels();
+picture();
+
+// For tests, and for whoever opens the console: what the page shows now.
+window.eqrt = {
+  get agents() { return scene.agents.map(({ id, x, y }) => ({ id, x, y })); },
+  get moment() {
+    const cycle = page.moment?.cycle;
+    return cycle ? { cycle: cycle.cycle, time_s: page.moment.time, mode: cycle.mode, shape: cycle.shape } : null;
+  },
+  get words() { return page.words; },
+  get paused() { return !page.timeline.playing; },
+  get live() { return page.timeline.live; },
+  get kept() { return page.timeline.cycles?.length ?? page.timeline.times.length; },
+  get selected() { return page.selected; },
+  get ghosts() { return page.moment ? page.moment.cycle.ghosts.filter((v) => v !== -32768).length / 2 : 0; },
+  get score() { return page.moment?.cycle.score ?? null; },
+  get lanes() { return page.moment?.cycle.on_map ? scene.lanes?.lanes.length ?? 0 : 0; },
+  get labels() { return scene.labels.boxes ?? []; },
+  get pixels() { return scene.agents.map(({ id, px, py }) => ({ id, px, py })); },
+  get connected() { return page.connected; },
+  get bytes() { return stream.bytes; },
+  get updates() { return stream.updates; },
+  get frames() { return page.frames; },
+  get timing() { return { frameTimes: [...page.frameTimes], scriptMs: [...page.scriptMs] }; },
+};

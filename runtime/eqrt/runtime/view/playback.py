@@ -1,0 +1,113 @@
+"""A recorded or replayed file, cycle by cycle, for pages that ask for the moment they show.
+
+The file is read once, from its start, by a thread; what pages are told is kept in a temporary file,
+so that any moment of an hour is at hand and the memory stays small.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import tempfile
+import threading
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from eqrt.core.errors import EqrtError
+from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.view.server import Outbox, ViewServer, Wanted
+from eqrt.runtime.view.updates import encode_status, encode_text
+from eqrt.runtime.view.watch import Lanes, Watch
+
+_TELL_S = 0.5  # how often pages hear how far the file is read
+
+
+class Playback:
+    """What pages are told of a file."""
+
+    def __init__(
+        self, records: Iterable[ForecastSet | ServiceStatus], name: str, tile: Path | None
+    ) -> None:
+        self._records, self._name = records, name
+        self._watch = Watch()
+        self._lanes = Lanes(load_tile(tile) if tile else None)
+        self._store = tempfile.TemporaryFile(prefix="eqrt-view-")
+        self._times_s: list[float] = []
+        self._ends: list[int] = [0]
+        self._lanes_from: list[tuple[int, str]] = []
+        self._statuses: list[msgspec.Raw] = []
+        self._thread = threading.Thread(target=self._read, name="read", daemon=True)
+        self._ended = threading.Event()
+        self.trouble = ""
+        self.done = False
+
+    def __enter__(self) -> Playback:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._store.close()
+
+    def greet(self, outbox: Outbox) -> None:
+        """What the file is, and how far it has been read."""
+        outbox.tell("hello", encode_text("hello", mode="file", name=self._name))
+        outbox.tell("index", self._index())
+        if self.trouble:
+            outbox.tell("trouble", encode_text("trouble", words=self.trouble))
+
+    def find(self, wanted: Wanted) -> Iterator[str | bytes]:
+        """The updates of these cycles, as far as they have been read, and the lanes there."""
+        last = min(wanted.last, len(self._times_s))
+        lanes = [message for start, message in self._lanes_from if start < last]
+        if lanes and len(lanes) - 1 != wanted.lanes:
+            yield lanes[-1]
+        for number in range(max(0, wanted.first), last):
+            start, end = self._ends[number], self._ends[number + 1]
+            yield os.pread(self._store.fileno(), end - start, start)
+
+    async def tell_progress(self, server: ViewServer) -> None:
+        """How far the file has been read, until all of it is."""
+        told = -1
+        while not self.done or told != len(self._times_s):
+            await asyncio.sleep(_TELL_S)
+            told = len(self._times_s)
+            server.tell("index", self._index())
+        if self.trouble:
+            server.tell("trouble", encode_text("trouble", words=self.trouble))
+
+    def _index(self) -> str:
+        done = self.done  # before the rest: what it says must be true of them
+        return encode_text(
+            "index",
+            times_s=[round(time_s, 4) for time_s in self._times_s],
+            done=done,
+            statuses=self._statuses if done else [],
+        )
+
+    def _read(self) -> None:
+        try:
+            for record in self._records:
+                if self._ended.is_set():
+                    return
+                self._take(record)
+        except EqrtError as error:
+            self.trouble = str(error)
+        finally:
+            self.done = True
+
+    def _take(self, record: ForecastSet | ServiceStatus) -> None:
+        if isinstance(record, ServiceStatus):
+            self._statuses.append(msgspec.Raw(encode_status(record, lost_cycles=0).encode()))
+            return
+        if (lanes := self._lanes.near(record)) is not None:
+            self._lanes_from.append((len(self._times_s), lanes))
+        update = self._watch.update(record)
+        os.pwrite(self._store.fileno(), update, self._ends[-1])
+        self._ends.append(self._ends[-1] + len(update))
+        self._times_s.append(record.timestamp_s)  # last: from now on it may be asked for

@@ -1,0 +1,133 @@
+"""One stream of cycles and statuses, turned into what pages are told, in order."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.prediction.tiles import Tile
+from eqrt.runtime.view.hindsight import Ghosts, Hindsight, Score
+from eqrt.runtime.view.updates import ego_pose, encode_lanes, encode_update, is_on_map
+
+KEPT_S = 60.0
+KEPT_BYTES = 64 << 20
+LANES_M = 500.0
+"""How far from the ego vehicle lanes are shown."""
+_LANES_STEP_M = 200.0  # how far it drives before it gets others
+
+
+class Watch:
+    """What happened, with hindsight; a service that starts again begins another stream."""
+
+    def __init__(self) -> None:
+        self.stream = 0
+        self._hindsight = Hindsight()
+        self._last: ForecastSet | None = None
+        self._mode: Mode | None = None
+        self.mode_since_s = 0.0
+
+    def add(self, forecast: ForecastSet) -> tuple[Ghosts, Score | None]:
+        """Take the next cycle: what became of the predictions before it."""
+        if self._last is not None and _started_again(self._last, forecast):
+            self.stream += 1
+            self._hindsight = Hindsight()
+            self._mode = None
+        if forecast.mode is not self._mode:
+            self._mode, self.mode_since_s = forecast.mode, forecast.timestamp_s
+        self._last = forecast
+        return self._hindsight.add(forecast), self._hindsight.score()
+
+    def update(self, forecast: ForecastSet) -> bytes:
+        """The same, as a page is told."""
+        ghosts, score = self.add(forecast)
+        return encode_update(
+            forecast,
+            ghosts=ghosts,
+            score=score,
+            stream=self.stream,
+            mode_since_s=self.mode_since_s,
+        )
+
+
+def _started_again(last: ForecastSet, now: ForecastSet) -> bool:
+    return (
+        now.cycle <= last.cycle
+        or now.model_id != last.model_id
+        or now.timestamp_s < last.timestamp_s
+    )
+
+
+class LastMinute:
+    """The updates of the last `KEPT_S`, or fewer where they would take too much memory."""
+
+    def __init__(self, kept_s: float = KEPT_S, kept_bytes: int = KEPT_BYTES) -> None:
+        self._updates: deque[tuple[float, bytes]] = deque()
+        self._kept_s, self._kept_bytes = kept_s, kept_bytes
+        self.bytes = 0
+
+    def add(self, time_s: float, update: bytes) -> None:
+        """Take the newest, let go of the oldest."""
+        if self._updates and time_s < self._updates[-1][0]:  # another clock
+            self.clear()
+        self._updates.append((time_s, update))
+        self.bytes += len(update)
+        while self._updates[0][0] < time_s - self._kept_s or (
+            self.bytes > self._kept_bytes and len(self._updates) > 1
+        ):
+            self.bytes -= len(self._updates.popleft()[1])
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._updates.clear()
+        self.bytes = 0
+
+    def newest_first(self) -> Iterator[bytes]:
+        """Those kept now; what comes later is not among them."""
+        return iter([update for _, update in reversed(self._updates)])
+
+
+class Lanes:
+    """The lanes around the ego vehicle, said again when it has driven on."""
+
+    def __init__(self, tile: Tile | None = None) -> None:
+        self._tile = tile
+        self._centre: tuple[float, float] | None = None
+        self.number = -1
+        """Of the newest message."""
+        self.message: str | None = None
+        """The newest, for whoever joins."""
+
+    def change(self, tile: Tile) -> None:
+        """Another map."""
+        self._tile, self._centre = tile, None
+
+    def near(self, forecast: ForecastSet) -> str | None:
+        """What to tell, if it is something new."""
+        if self._tile is None or not is_on_map(forecast):
+            return None
+        position = _whereabouts(forecast)
+        if position is None or (
+            self._centre is not None and _far(position, self._centre) < _LANES_STEP_M
+        ):
+            return None
+        self._centre = position
+        self.number += 1
+        self.message = encode_lanes(
+            self._tile, centre=position, radius_m=LANES_M, number=self.number
+        )
+        return self.message
+
+
+def _whereabouts(forecast: ForecastSet) -> tuple[float, float] | None:
+    """The ego vehicle's place, else the targets'; None = there is neither."""
+    if (ego := ego_pose(forecast)) is not None:
+        return ego[0], ego[1]
+    if not forecast.num_targets:
+        return None
+    x_m, y_m = forecast.position.mean(axis=0).tolist()
+    return x_m, y_m
+
+
+def _far(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return max(abs(a[0] - b[0]), abs(a[1] - b[1]))

@@ -1,0 +1,76 @@
+"""Modes, classes and counters in words that need no manual; page and terminal say the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from eqrt.runtime.decoding.detections import ObjectClass
+from eqrt.runtime.output.forecasts import Mode
+
+GOOD, LIMITED, BAD = "good", "limited", "bad"
+
+LEVELS = {
+    Mode.RUN: GOOD,
+    Mode.NO_MAP: LIMITED,
+    Mode.NO_POSE: LIMITED,
+    Mode.PARTIAL: LIMITED,
+    Mode.LATE: LIMITED,
+    Mode.FALLBACK: BAD,
+    Mode.SILENT: BAD,
+}
+"""How much of the service there is."""
+
+AGENT_WORDS = {
+    Mode.RUN: "by the model, from a full history",
+    Mode.PARTIAL: "by the model, from a short history",
+    Mode.FALLBACK: "at constant turn rate and speed, without the model",
+}
+AGENT_BRIEF = {Mode.RUN: "model", Mode.PARTIAL: "model, short history", Mode.FALLBACK: "no model"}
+
+CLASS_WORDS = {kind: kind.name.lower() for kind in ObjectClass} | {ObjectClass.UNKNOWN: "object"}
+
+DROPS = {
+    "can_failed": "predictions that the CAN bus did not take",
+    "datagrams_failed": "datagrams that could not be sent",
+    "decoder_bad_checksum": "messages with a wrong checksum",
+    "decoder_short": "messages too short",
+    "decoder_stray": "messages without their header",
+    "decoder_incomplete_cycles": "object lists incomplete",
+    "ego_refused": "ego values that are not possible",
+    "tracks_refused": "measurements that are not possible",
+    "tracks_dropped": "tracks dropped: too many",
+    "tracks_resets": "times that all tracks were forgotten",
+}
+"""Counter of the service (docs/output.md) -> what it counts. All are 0 when all is well."""
+
+
+def mode_words(mode: Mode, num_targets: int) -> str:
+    """What the mode of a cycle means for whoever watches."""
+    match mode:
+        case Mode.RUN:
+            return "Full service: model, map and ego motion"
+        case Mode.NO_MAP:
+            return "No map here: predicting without lanes"
+        case Mode.NO_POSE if num_targets:
+            return "No map pose: predicting without lanes"
+        case Mode.NO_POSE:
+            return "No ego motion: nothing is predicted"
+        case Mode.LATE:
+            return "Late: predicting took longer than one period"
+        case Mode.FALLBACK:
+            return "Without the model: constant turn rate and speed"
+        case Mode.SILENT:
+            return "No input from the sensor: earlier predictions are void"
+        case _:
+            return mode.name
+
+
+def class_words(number: int) -> str:
+    """Of an `ObjectClass`, also of one that this version does not know."""
+    return CLASS_WORDS[ObjectClass(number)] if number in CLASS_WORDS else "object"
+
+
+def drops(totals: Mapping[str, int]) -> dict[str, int]:
+    """What went wrong since the start, in words: only what did."""
+    counted = {words: totals.get(name, 0) for name, words in DROPS.items()}
+    return {words: count for words, count in counted.items() if count}
