@@ -14,7 +14,7 @@ PYTEST_ARGS ?= -n 2 --dist loadfile
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: $(RUNTIME_VENV)/.installed ## see it work: recorded traffic over CAN, predicted and scored
+demo: $(RUNTIME_VENV)/.installed-view ## see it work: recorded traffic over CAN, predicted and scored
 	@$(RUNTIME_VENV)/bin/eqrt demo
 
 test: $(VENV)/.installed test-runtime ## run all tests: without torch what ships to the car, then the rest
@@ -70,12 +70,16 @@ PIP_INSTALL = -m pip install -qq --disable-pip-version-check --constraint constr
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(call create_environment,$(VENV),the workstation: torch and linters)
 	@$(VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
-	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps,data,scale,sim,bridges]' --group dev
+	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps,data,scale,sim,bridges,view]' --group dev
 	@touch $@
 
 $(RUNTIME_VENV)/.installed: pyproject.toml constraints.txt
 	$(call create_environment,$(RUNTIME_VENV),what ships to the car)
 	@$(RUNTIME_VENV)/bin/python $(PIP_INSTALL) --editable .
+	@touch $@
+
+$(RUNTIME_VENV)/.installed-view: $(RUNTIME_VENV)/.installed
+	@$(RUNTIME_VENV)/bin/python $(PIP_INSTALL) --editable '.[view]'
 	@touch $@
 
 $(RUNTIME_VENV)/.installed-tests: $(RUNTIME_VENV)/.installed

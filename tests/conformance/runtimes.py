@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from conformance.browser import Browser
-from conformance.environments import FOLDER, oldest_dependencies, python_with, run
+from browser import PROGRAMS, Browser
+from conformance.environments import FOLDER, need, oldest_dependencies, python_with, run
 from conformance.readme import README, served
 from source_tree import ROOT
 
@@ -120,6 +120,7 @@ def _node() -> Runtime:
 
 
 def _browser() -> Iterator[Runtime]:
+    need(*PROGRAMS)
     with served(README) as page, Browser() as browser:
         yield Runtime(
             name="onnxruntime-web",

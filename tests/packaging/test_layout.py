@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +24,8 @@ FORBIDDEN = [  # a file, and what must not be imported in it
     ("runtime/eqrt/core/frames.py", "eqrt.runtime"),
     ("runtime/eqrt/runtime/decoding/detections.py", "eqrt.training"),
     ("runtime/eqrt/cli.py", "onnx"),
+    ("runtime/eqrt/runtime/serve.py", "rich"),
+    ("runtime/eqrt/runtime/serve.py", "eqrt.runtime.view"),
     ("training/eqrt/training/__init__.py", "eqrt.runtime"),
     ("export/eqrt/export/__init__.py", "eqrt.cli"),
 ]
@@ -80,9 +83,11 @@ def test_types_are_checked_in_every_source_root_and_in_the_tests(tmp_path: Path)
         assert f"{path.relative_to(tmp_path)}:1: error: Incompatible types" in said
 
 
-def imported_names(folder: Path) -> Iterator[str]:
+def imported_names(folder: Path, without: Path | None = None) -> Iterator[str]:
     """The first word of every absolute import in a folder, wherever in a file it stands."""
     for path in folder.rglob("*.py"):
+        if without is not None and path.is_relative_to(without):
+            continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 yield from (alias.name.partition(".")[0] for alias in node.names)
@@ -95,15 +100,28 @@ def test_core_needs_numpy_and_the_standard_library_only() -> None:
     assert third_party == {"eqrt", "numpy"}
 
 
-def test_the_car_imports_what_the_wheel_depends_on_and_nothing_else() -> None:
-    required = {
-        re.split(r"[\[<>=!~; ]", line)[0]
-        for line in importlib.metadata.requires("eqrt") or []
-        if "extra ==" not in line
-    }
+def required() -> set[str]:
+    """The distributions that the wheel depends on without any extra."""
+    lines = importlib.metadata.requires("eqrt") or []
+    return {re.split(r"[\[<>=!~; ]", line)[0] for line in lines if "extra ==" not in line}
+
+
+def distributions(names: set[str]) -> set[str]:
+    """What brings these modules; the standard library and eqrt itself left out."""
     providers = importlib.metadata.packages_distributions()
-    imported = set(imported_names(ROOT / "runtime")) - sys.stdlib_module_names - {"eqrt"}
-    assert {dist for name in imported for dist in providers[name]} == required
+    return {dist for name in names - sys.stdlib_module_names - {"eqrt"} for dist in providers[name]}
+
+
+def test_the_car_imports_what_the_wheel_depends_on_and_nothing_else() -> None:
+    imported = set(imported_names(ROOT / "runtime", without=ROOT / "runtime/eqrt/runtime/view"))
+    assert distributions(imported) == required()
+
+
+def test_the_viewer_imports_what_its_extra_brings_besides() -> None:
+    extra = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    brought = {re.split(r"[<>=]", line)[0] for line in extra["optional-dependencies"]["view"]}
+    imported = distributions(set(imported_names(ROOT / "runtime/eqrt/runtime/view")))
+    assert imported - required() == brought
 
 
 def test_eqrt_is_a_namespace_that_no_source_root_owns() -> None:

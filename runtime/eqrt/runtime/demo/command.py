@@ -1,8 +1,9 @@
 """`eqrt demo`: recorded traffic over a CAN bus, predicted by the service and scored as it happens.
 
     eqrt play  --messages-->  eqrt serve  --datagrams-->  this process: scores and draws
+                                          --datagrams-->  eqrt view: a page in a browser
 
-Three processes and no CAN hardware: the bus is `eqrt_local`. Nothing here knows the future; the
+Processes and no CAN hardware: the bus is `eqrt_local`. Nothing here knows the future; the
 truth of a prediction is where the same track is measured a little later.
 """
 
@@ -14,11 +15,10 @@ import math
 import os
 import socket
 import subprocess
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +27,10 @@ import numpy as np
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.demo.picture import render
+from eqrt.runtime.demo.programs import eqrt, running
 from eqrt.runtime.demo.score import Scoreboard
 from eqrt.runtime.demo.snapshots import BestMoment
+from eqrt.runtime.demo.viewing import watched
 from eqrt.runtime.output.datagrams import Datagram, decode_datagram
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.prediction.tiles import load_tile
@@ -92,6 +94,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         help="where to write a picture of each part, eqrt-demo-PART.svg (default: here)",
     )
+    parser.add_argument(
+        "--view",
+        action=argparse.BooleanOptionalAction,
+        help="let it be watched in a browser, or not (default: if the extra `view` is installed)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -100,12 +107,13 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--seconds is {args.seconds}; give a number above 0, 10 shows something")
     _make_folder(args.out)
     parts = [part for part in PARTS if args.part in (None, part.name)]
-    for index, part in enumerate(parts):
-        print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
-        result = play_part(part, args.seconds)
-        result.print_summary()
-        picture = result.write_picture(args.out / f"eqrt-demo-{part.name}.svg")
-        print(f"  picture    {picture if picture else 'none: nothing could be scored'}")
+    with watched(args.view) as viewers:
+        for index, part in enumerate(parts):
+            print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
+            result = play_part(part, args.seconds, viewers)
+            result.print_summary()
+            picture = result.write_picture(args.out / f"eqrt-demo-{part.name}.svg")
+            print(f"  picture    {picture if picture else 'none: nothing could be scored'}")
     return 0
 
 
@@ -140,15 +148,16 @@ class PartResult:
         return path.resolve()
 
 
-def play_part(part: Part, seconds: float | None) -> PartResult:
-    """Run one part to its end, a line a second."""
+def play_part(part: Part, seconds: float | None, viewers: Sequence[str] = ()) -> PartResult:
+    """Run one part to its end, a line a second. `viewers`: where datagrams go besides."""
     result = PartResult(part, Scoreboard(), BestMoment(), [])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(0.2)
         address = f"127.0.0.1:{receiver.getsockname()[1]}"
         channel = f"eqrt-demo-{os.getpid()}"
-        with _service(part, channel, address), _player(part, channel) as player:
+        to = [address, *viewers]
+        with _service(part, channel, to), _player(part, channel) as player:
             started_s = time.monotonic()
             line_due_s = started_s + 1.0
             for forecast in _forecasts(receiver, player, seconds):
@@ -213,10 +222,11 @@ def _forecasts(
 
 
 @contextlib.contextmanager
-def _service(part: Part, channel: str, address: str) -> Iterator[None]:
+def _service(part: Part, channel: str, addresses: Sequence[str]) -> Iterator[None]:
     """`eqrt serve` in a process of its own, from when it listens until the end of the block."""
-    command = [*_eqrt("serve"), "--can", channel, "--can-interface", LOCAL, *part.serve]
-    with _process([*command, "--datagrams", address, "--out-can", channel, "--quiet"]) as service:
+    command = [*eqrt("serve"), "--can", channel, "--can-interface", LOCAL, *part.serve]
+    command += [f"--datagrams={address}" for address in addresses]
+    with running([*command, "--out-can", channel, "--quiet"]) as service:
         _wait_until_ready(service)
         yield
 
@@ -238,24 +248,6 @@ def _wait_until_ready(service: subprocess.Popen[str]) -> None:
 @contextlib.contextmanager
 def _player(part: Part, channel: str) -> Iterator[subprocess.Popen[str]]:
     """`eqrt play` in a process of its own."""
-    command = [*_eqrt("play"), str(part.log), "--can", channel, "--can-interface", LOCAL]
-    with _process(command) as player:
+    command = [*eqrt("play"), str(part.log), "--can", channel, "--can-interface", LOCAL]
+    with running(command) as player:
         yield player
-
-
-def _eqrt(command: str) -> list[str]:
-    return [sys.executable, "-m", "eqrt", command]
-
-
-@contextlib.contextmanager
-def _process(command: list[str]) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
-        yield process
-    finally:
-        process.terminate()
-        try:
-            process.communicate(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()

@@ -86,9 +86,7 @@ class Hindsight:
             position[rows, column] = places[0]
             for of, place in zip(errors, places, strict=True):
                 of[rows, column] = displacement(place, now.position[rows])
-        return Ghosts(
-            position=position, error_m=errors[0], constant_velocity_error_m=errors[1]
-        )
+        return Ghosts(position=position, error_m=errors[0], constant_velocity_error_m=errors[1])
 
     def _cycle_at(self, time_s: float) -> ForecastSet | None:
         best = min(self._recent, key=lambda f: abs(f.timestamp_s - time_s), default=None)
@@ -97,9 +95,7 @@ class Hindsight:
         return best
 
 
-def _same_targets(
-    now: ForecastSet, then: ForecastSet
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _same_targets(now: ForecastSet, then: ForecastSet) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of `now`, and the rows of the same tracks in `then`; only what was measured since."""
     _, rows, old = np.intersect1d(
         now.track_id, then.track_id, assume_unique=True, return_indices=True
@@ -132,7 +128,7 @@ def _straight_on(then: ForecastSet, rows: NDArray[np.intp], ahead_s: Float64) ->
     velocity = (then.position[rows] - before) / (steps * then.dt_s)
     place = then.position[rows] + velocity * ahead_s[:, None]
     place[~then.history_valid[rows, -1 - steps]] = np.nan
-    return place
+    return np.asarray(place)
 
 
 class _Tally:
@@ -146,7 +142,9 @@ class _Tally:
         if scored:
             truth = np.array([s.truth for s in scored])
             tables = [
-                error_table(displacement(np.array(lines), truth), forecast.dt_s, _horizons(forecast))
+                error_table(
+                    displacement(np.array(lines), truth), forecast.dt_s, _horizons(forecast)
+                )
                 for lines in (
                     [s.predicted for s in scored],
                     [s.constant_velocity for s in scored],

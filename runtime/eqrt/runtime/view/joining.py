@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def joined(parts: Sequence[ForecastSet]) -> ForecastSet:
     """One cycle from some of its targets each."""
     if len(parts) == 1:
         return parts[0]
-    arrays = {
+    arrays: dict[str, Any] = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in fields(ForecastSet)
         if isinstance(getattr(parts[0], field.name), np.ndarray)

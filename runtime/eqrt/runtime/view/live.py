@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import msgspec
 
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.output.datagrams import Datagram, decode_datagram
@@ -19,6 +22,7 @@ from eqrt.runtime.view.watch import Lanes, LastMinute, Watch
 
 _RECEIVE_BYTES = 1 << 20  # 5 s of 64 objects with one mode: what comes while the viewer is busy
 _LARGEST_BYTES = 65_535
+_STATUSES = 61  # a minute
 
 Record = ForecastSet | ServiceStatus
 
@@ -92,7 +96,7 @@ class Live:
         self._lanes = Lanes(load_tile(tile) if tile else None)
         self._fixed_tile = tile is not None
         self._tile_name = ""
-        self._status: str | None = None
+        self._statuses: deque[msgspec.Raw] = deque(maxlen=_STATUSES)
         self._said = ""
 
     def greet(self, outbox: Outbox) -> None:
@@ -100,8 +104,7 @@ class Live:
         outbox.tell("hello", encode_text("hello", mode="live", address=self._address))
         if self._lanes.message:
             outbox.tell("lanes", self._lanes.message)
-        if self._status:
-            outbox.tell("status", self._status)
+        outbox.tell("statuses", encode_text("statuses", statuses=list(self._statuses)))
         if self._said:
             outbox.tell("trouble", encode_text("trouble", words=self._said))
         outbox.fill_in(self._minute.newest_first())
@@ -128,8 +131,9 @@ class Live:
         server.show(update)
 
     def _take_status(self, status: ServiceStatus, server: ViewServer) -> None:
-        self._status = encode_status(status, lost_cycles=self._ear.lost_cycles)
-        server.tell("status", self._status)
+        text = encode_status(status, lost_cycles=self._ear.lost_cycles)
+        self._statuses.append(msgspec.Raw(text.encode()))
+        server.tell("status", text)
         if status.tile and status.tile != self._tile_name and not self._fixed_tile:
             self._tile_name = status.tile
             try:

@@ -35,9 +35,8 @@ class Playback:
         self._records, self._name = records, name
         self._watch = Watch()
         self._lanes = Lanes(load_tile(tile) if tile else None)
-        self._store = tempfile.TemporaryFile(prefix="eqrt-view-")
+        self._store = _Store()
         self._times_s: list[float] = []
-        self._ends: list[int] = [0]
         self._lanes_from: list[tuple[int, str]] = []
         self._statuses: list[msgspec.Raw] = []
         self._thread = threading.Thread(target=self._read, name="read", daemon=True)
@@ -58,6 +57,8 @@ class Playback:
         """What the file is, and how far it has been read."""
         outbox.tell("hello", encode_text("hello", mode="file", name=self._name))
         outbox.tell("index", self._index())
+        if self.done:
+            outbox.tell("statuses", encode_text("statuses", statuses=self._statuses))
         if self.trouble:
             outbox.tell("trouble", encode_text("trouble", words=self.trouble))
 
@@ -68,8 +69,7 @@ class Playback:
         if lanes and len(lanes) - 1 != wanted.lanes:
             yield lanes[-1]
         for number in range(max(0, wanted.first), last):
-            start, end = self._ends[number], self._ends[number + 1]
-            yield os.pread(self._store.fileno(), end - start, start)
+            yield self._store.read(number)
 
     async def tell_progress(self, server: ViewServer) -> None:
         """How far the file has been read, until all of it is."""
@@ -78,6 +78,7 @@ class Playback:
             await asyncio.sleep(_TELL_S)
             told = len(self._times_s)
             server.tell("index", self._index())
+        server.tell("statuses", encode_text("statuses", statuses=self._statuses))
         if self.trouble:
             server.tell("trouble", encode_text("trouble", words=self.trouble))
 
@@ -87,7 +88,6 @@ class Playback:
             "index",
             times_s=[round(time_s, 4) for time_s in self._times_s],
             done=done,
-            statuses=self._statuses if done else [],
         )
 
     def _read(self) -> None:
@@ -108,6 +108,28 @@ class Playback:
         if (lanes := self._lanes.near(record)) is not None:
             self._lanes_from.append((len(self._times_s), lanes))
         update = self._watch.update(record)
-        os.pwrite(self._store.fileno(), update, self._ends[-1])
-        self._ends.append(self._ends[-1] + len(update))
+        self._store.append(update)
         self._times_s.append(record.timestamp_s)  # last: from now on it may be asked for
+
+
+class _Store:
+    """Updates in a file without a name, which goes when it is closed; read while it is written."""
+
+    def __init__(self) -> None:
+        self._file, name = tempfile.mkstemp(prefix="eqrt-view-")
+        os.unlink(name)
+        self._ends = [0]
+
+    def append(self, update: bytes) -> None:
+        """The next one."""
+        os.pwrite(self._file, update, self._ends[-1])
+        self._ends.append(self._ends[-1] + len(update))
+
+    def read(self, number: int) -> bytes:
+        """One of those appended, counted from 0."""
+        start, end = self._ends[number], self._ends[number + 1]
+        return os.pread(self._file, end - start, start)
+
+    def close(self) -> None:
+        """Give the space back."""
+        os.close(self._file)

@@ -124,7 +124,7 @@ class _Past:
         """(A, T, 2) and (A, T): steps of `dt_s` up to each anchor, between measurements."""
         dt_s, now_s = lines[0].dt_s, lines[0].time_s
         steps = round(HISTORY_S / dt_s)
-        back_s = dt_s * np.arange(1 - steps, 1)
+        back_s = dt_s * np.arange(1 - steps, 1, dtype=np.float64)
         rows = [self._row(line, line.anchor_s + back_s) for line in lines]
         self._forget(now_s - HISTORY_S - 1.0)
         return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])

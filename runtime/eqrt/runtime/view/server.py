@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import mimetypes
 from collections import deque
 from collections.abc import Iterator
 from http import HTTPStatus

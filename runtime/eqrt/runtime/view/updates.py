@@ -168,15 +168,13 @@ def encode_status(status: ServiceStatus, *, lost_cycles: int) -> str:
     )
 
 
-def encode_lanes(
-    tile: Tile, *, centre: tuple[float, float], radius_m: float, number: int
-) -> str:
+def encode_lanes(tile: Tile, *, centre: tuple[float, float], radius_m: float, number: int) -> str:
     """The centerlines that pass within `radius_m` of `centre`, in centimetres from there.
 
     `number` tells one such message from another.
     """
     points, starts = tile.lane_map.points, tile.lane_map.lane_start
-    near = (np.abs(points - np.float32(centre)) <= radius_m).all(axis=1)
+    near = (np.abs(points - np.array(centre, np.float32)) <= radius_m).all(axis=1)
     touched = np.add.reduceat(near, starts[:-1]) > 0
     lanes = [
         np.rint(100.0 * (points[starts[lane] : starts[lane + 1]].astype(float) - centre))

@@ -20,12 +20,20 @@ LEVELS = {
 }
 """How much of the service there is."""
 
+MODE_WORDS = {
+    Mode.RUN: "Full service: model, map and ego motion",
+    Mode.NO_MAP: "No map here: predicting without lanes",
+    Mode.NO_POSE: "No map pose: predicting without lanes",
+    Mode.LATE: "Late: predicting took longer than one period",
+    Mode.FALLBACK: "Without the model: constant turn rate and speed",
+    Mode.SILENT: "No input from the sensor: earlier predictions are void",
+}
 AGENT_WORDS = {
     Mode.RUN: "by the model, from a full history",
     Mode.PARTIAL: "by the model, from a short history",
     Mode.FALLBACK: "at constant turn rate and speed, without the model",
 }
-AGENT_BRIEF = {Mode.RUN: "model", Mode.PARTIAL: "model, short history", Mode.FALLBACK: "no model"}
+AGENT_BRIEF = {Mode.RUN: "full history", Mode.PARTIAL: "short history", Mode.FALLBACK: "no model"}
 
 CLASS_WORDS = {kind: kind.name.lower() for kind in ObjectClass} | {ObjectClass.UNKNOWN: "object"}
 
@@ -46,23 +54,9 @@ DROPS = {
 
 def mode_words(mode: Mode, num_targets: int) -> str:
     """What the mode of a cycle means for whoever watches."""
-    match mode:
-        case Mode.RUN:
-            return "Full service: model, map and ego motion"
-        case Mode.NO_MAP:
-            return "No map here: predicting without lanes"
-        case Mode.NO_POSE if num_targets:
-            return "No map pose: predicting without lanes"
-        case Mode.NO_POSE:
-            return "No ego motion: nothing is predicted"
-        case Mode.LATE:
-            return "Late: predicting took longer than one period"
-        case Mode.FALLBACK:
-            return "Without the model: constant turn rate and speed"
-        case Mode.SILENT:
-            return "No input from the sensor: earlier predictions are void"
-        case _:
-            return mode.name
+    if mode is Mode.NO_POSE and not num_targets:
+        return "No ego motion: nothing is predicted"
+    return MODE_WORDS.get(mode, mode.name)
 
 
 def class_words(number: int) -> str:

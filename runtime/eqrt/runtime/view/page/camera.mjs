@@ -2,7 +2,10 @@
 
 const LEAST = 0.4; // pixels per metre
 const MOST = 60;
-const SHOWN_AHEAD_M = 125; // along the screen's height, when the page opens
+const SHOWN_M = 130; // along the way, when the page opens
+
+/** What the screen's axes can be held to, in the order in which a key goes through them. */
+export const TURNS = ["right", "up", "north"];
 
 export class Camera {
   constructor() {
@@ -10,7 +13,7 @@ export class Camera {
     this.y = 0;
     this.scale = 0; // pixels per metre; 0 = not chosen yet
     this.turn = 0; // radians, counter-clockwise, from the map's axes to the screen's
-    this.headingUp = true;
+    this.axis = "up"; // where the ego vehicle drives to on the screen, or "north"
     this.follow = "ego"; // or "selected", or "free"
     this.width = 1;
     this.height = 1;
@@ -19,22 +22,25 @@ export class Camera {
   resize(width, height) {
     this.width = width;
     this.height = height;
-    if (!this.scale) this.scale = Math.max(LEAST, height / SHOWN_AHEAD_M);
+    if (this.scale) return;
+    this.axis = width > height ? "right" : "up"; // traffic is longer than wide
+    this.scale = Math.max(LEAST, Math.max(width, height) / SHOWN_M);
   }
 
-  /** Pixel where (x, y) of the camera is: lower than the middle when there is more to see ahead. */
+  /** Pixel where (x, y) of the camera is: off the middle when there is more to see ahead. */
   get middle() {
-    const ahead = this.headingUp && this.follow === "ego";
-    return [this.width / 2, this.height * (ahead ? 0.68 : 0.5)];
+    const ahead = this.follow === "ego" ? this.axis : "north";
+    return [this.width * (ahead === "right" ? 0.36 : 0.5), this.height * (ahead === "up" ? 0.66 : 0.5)];
   }
 
-  /** Looks at a place; `yaw` is the direction that is up when heading up. */
+  /** Looks at a place; `yaw` is where the ego vehicle heads to, null = not known. */
   lookAt(x, y, yaw) {
     if (this.follow !== "free") {
       this.x = x;
       this.y = y;
     }
-    this.turn = this.headingUp && yaw !== null ? Math.PI / 2 - yaw : 0;
+    const held = { up: Math.PI / 2 - yaw, right: -yaw, north: 0 };
+    this.turn = yaw === null ? 0 : held[this.axis];
   }
 
   /** [a, b, c, d, e, f] for setTransform: metres from (ox, oy) of the map to pixels, times `ratio`. */

@@ -3,7 +3,8 @@
 import { FONT } from "./scene.mjs";
 
 const HEIGHT = 13;
-const PLACES = [[11, 4], [11, -10], [11, 18], [-11, 4], [-11, -10], [-11, 18]]; // px beside an agent
+const PLACES = [[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]]; // around an agent
+const GAP = 3; // px
 const WORDS_FROM = 5.5; // pixels per metre from which the class is written too
 const MARGIN = 2;
 
@@ -15,14 +16,15 @@ export class Labels {
   }
 
   /** Nearest to the ego vehicle first, the selected one before all. */
-  draw(context, agents, { cycle, camera, colours, selected }) {
+  draw(context, agents, { cycle, camera, colours, selected, keepFree }) {
     context.font = FONT;
     context.textBaseline = "middle";
     const range = (agent) => (agent.id === selected ? -1 : cycle.agents.range_m[agent.row] ?? 0);
     const order = agents
       .filter(({ px, py }) => px > -20 && py > -20 && px < camera.width + 20 && py < camera.height + 20)
       .sort((a, b) => range(a) - range(b));
-    const taken = order.map(({ px, py }) => [px - 5, py - 5, px + 5, py + 5]);
+    const taken = order.map(({ px, py, halfX, halfY }) => [px - halfX, py - halfY, px + halfX, py + halfY]);
+    if (keepFree) taken.push(keepFree);
     const places = new Map();
     this.boxes = [];
     for (const agent of order) {
@@ -71,10 +73,11 @@ export class Labels {
   }
 }
 
-function boxAt({ px, py }, [dx, dy], width) {
-  const left = dx > 0 ? px + dx : px + dx - width - 2 * MARGIN;
-  const top = py + dy - HEIGHT / 2 - 4;
-  return [left, top, left + width + 2 * MARGIN, top + HEIGHT];
+function boxAt({ px, py, halfX, halfY }, [sideX, sideY], width) {
+  const [w, h] = [width / 2 + MARGIN, HEIGHT / 2];
+  const x = px + sideX * (halfX + GAP + w);
+  const y = py + sideY * (sideX ? Math.min(halfY, 4) + h : halfY + GAP + h);
+  return [x - w, y - h, x + w, y + h];
 }
 
 function overlap(a, b) {

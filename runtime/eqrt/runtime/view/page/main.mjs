@@ -1,6 +1,6 @@
 // The page: what comes in, what is shown, what keys and buttons do.
 
-import { Camera } from "./camera.mjs";
+import { Camera, TURNS } from "./camera.mjs";
 import { set, showBanner, showScore, showSelected, showService } from "./panels.mjs";
 import { Scene, egoAt } from "./scene.mjs";
 import { showSigns } from "./signs.mjs";
@@ -53,11 +53,13 @@ function hear(message) {
     case "status":
       if (message.time_s < (page.statuses.at(-1)?.time_s ?? 0)) page.statuses = [];
       page.statuses.push(message);
-      if (page.statuses.length > KEPT_STATUSES) page.statuses.shift();
+      if (page.statuses.length > KEPT_STATUSES) page.statuses.shift(); // only live ones come singly
+      break;
+    case "statuses":
+      page.statuses = message.statuses;
       break;
     case "index":
       timeline.index(message);
-      if (message.statuses.length) page.statuses = message.statuses;
       break;
     case "trouble":
       page.trouble = message.words;
@@ -180,8 +182,8 @@ const actions = {
   closer: () => camera.zoom(1.25),
   farther: () => camera.zoom(0.8),
   turn: () => {
-    camera.headingUp = !camera.headingUp;
-    set("turn", camera.headingUp ? "Heading up" : "North up");
+    camera.axis = TURNS[(TURNS.indexOf(camera.axis) + 1) % TURNS.length];
+    sayTurn();
   },
   follow: () => follow(nextToFollow()),
   ghosts: () => {
@@ -199,6 +201,11 @@ const keys = {
   "+": "closer", "=": "closer", "-": "farther", n: "turn", f: "follow", g: "ghosts", "?": "help",
   Escape: "unselect",
 };
+
+function sayTurn() {
+  const words = { up: "Heading up", right: "Heading right", north: "North up" };
+  set("turn", words[camera.axis]);
+}
 
 function nextToFollow() {
   if (camera.follow === "free") return "ego";
@@ -303,6 +310,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", dress);
 new ResizeObserver(() => scene.resize(camera)).observe(canvas);
 
 scene.resize(camera);
+sayTurn();
 dress();
 setInterval(panels, PANELS_MS);
 panels();

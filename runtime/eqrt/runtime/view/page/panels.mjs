@@ -16,7 +16,7 @@ export function showBanner({ connected, hello, moment, status, silent, waiting }
   } else if (moment) {
     const { cycle } = moment;
     const since = moment.time - cycle.mode_since_s;
-    const lasts = cycle.level === "good" || since < 1 ? "" : `, ${ago(since)}`;
+    const lasts = cycle.level === "good" || since < 1 ? "" : `, for ${ago(since)}`;
     [level, words] = [cycle.level, `${cycle.mode_words}${lasts}`];
     if (silent > STALE_S) [level, words] = ["lost", `Nothing heard of the service for ${ago(silent)}`];
   } else if (hello) {
@@ -119,10 +119,10 @@ export function showScore(score) {
     set("score-words", "None can be judged yet: what was predicted must first happen.");
     return;
   }
-  set("score-words", `Mean error on the way, of ${score.count} predictions:`);
+  set("score-words", `Mean distance from what happened, of ${score.count} predictions, in metres:`);
   const horizons = Object.keys(score.eqrt).filter((name) => name.startsWith("ade"));
-  const row = (kind, name, table) => [kind, name, ...horizons.map((h) => `${table[h].toFixed(2)} m`)];
-  showTable("score-table", ["", "", ...horizons.map((h) => `${h.slice(4, -1)} s`)], [
+  const row = (kind, name, table) => [kind, name, ...horizons.map((h) => `${table[h].toFixed(2)}`)];
+  showTable("score-table", ["", "over the first", ...horizons.map((h) => `${h.slice(4, -1)} s`)], [
     row("us", "eqrt", score.eqrt),
     row("", "constant velocity", score.constant_velocity),
   ]);
@@ -134,7 +134,7 @@ export function showSelected(moment, id) {
   by("selected").hidden = id === null;
   if (id === null) return false;
   set("selected-name", row === undefined ? `${id}` : `${id}, ${moment.cycle.agents.kind[row]}`);
-  for (const part of ["selected-numbers", "selected-modes", "selected-errors"]) {
+  for (const part of ["selected-numbers", "selected-modes", "selected-errors-words", "selected-errors"]) {
     by(part).hidden = row === undefined;
   }
   if (row === undefined) {
@@ -149,8 +149,8 @@ export function showSelected(moment, id) {
     ["speed", number(agents.speed_mps[row], 1, "m/s")],
     ["from ego", number(agents.range_m[row], 1, "m")],
     ["length × width", size],
-    ["measured", `${Math.round(1000 * agents.age_s[row])} ms before`],
-    ["number at the sensor", `${agents.object_id[row]}`],
+    ["age of measurement", `${Math.round(1000 * agents.age_s[row])} ms`],
+    ["the sensor's number", `${agents.object_id[row]}`],
   ]);
   showModes(agents.probabilities[row]);
   showErrors(agents, row);
@@ -175,8 +175,8 @@ function showModes(probabilities) {
 }
 
 function showErrors(agents, row) {
-  const cells = (values) => values.map((value) => (value === null ? "–" : `${value.toFixed(2)} m`));
-  showTable("selected-errors", ["", "off now, said before", "1 s", "2 s", "3 s"], [
+  const cells = (values) => values.map((value) => (value === null ? "–" : `${value.toFixed(2)}`));
+  showTable("selected-errors", ["", "predicted before", "1 s", "2 s", "3 s"], [
     ["us", "eqrt", ...cells(agents.error_m[row])],
     ["", "constant velocity", ...cells(agents.constant_velocity_error_m[row])],
   ]);

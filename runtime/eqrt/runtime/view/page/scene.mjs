@@ -62,7 +62,7 @@ export class Scene {
     if (this.ghosts) this.#drawGhosts(cycle, camera);
     this.#drawAgents(cycle, camera, selected);
     this.#drawEgo(moment, camera);
-    this.labels.draw(context, this.agents, { cycle, camera, colours, selected });
+    this.labels.draw(context, this.agents, { cycle, camera, colours, selected, keepFree: this.ego });
     this.#drawScale(camera);
   }
 
@@ -92,8 +92,28 @@ export class Scene {
         heading = between(heading, next.agents.heading_rad[later], part);
       }
       const [px, py] = camera.pixels(x, y);
-      this.agents.push({ id, row, x, y, px, py, heading });
+      const agent = { id, row, x, y, px, py, heading };
+      this.#measure(agent, agents, camera);
+      this.agents.push(agent);
     }
+  }
+
+  /** An agent's size on the screen: of its box, or of a dot where little is known. */
+  #measure(agent, columns, camera) {
+    const usual = SIZES[columns.kind[agent.row]];
+    const length = columns.length_m[agent.row] ?? usual?.[0];
+    const width = columns.width_m[agent.row] ?? usual?.[1];
+    agent.dot = length === undefined || width === undefined || agent.heading === null;
+    if (agent.dot) {
+      agent.long = agent.wide = agent.halfX = agent.halfY = Math.max(LEAST_PX / 2, DOT_M * camera.scale);
+      return;
+    }
+    agent.long = Math.max(LEAST_PX * 1.6, length * camera.scale) / 2;
+    agent.wide = Math.max(LEAST_PX, width * camera.scale) / 2;
+    const angle = agent.heading + camera.turn;
+    const [cos, sin] = [Math.abs(Math.cos(angle)), Math.abs(Math.sin(angle))];
+    agent.halfX = cos * agent.long + sin * agent.wide;
+    agent.halfY = sin * agent.long + cos * agent.wide;
   }
 
   #drawLanes(camera) {
@@ -123,8 +143,8 @@ export class Scene {
     context.lineCap = "butt";
     context.lineJoin = "bevel";
     context.strokeStyle = colours.past;
-    context.globalAlpha = 0.75 * faded;
-    context.lineWidth = 1.5 / scale;
+    context.globalAlpha = 0.6 * faded;
+    context.lineWidth = 1.3 / scale;
     context.stroke(layer.history);
     if (layer.ellipses) {
       context.fillStyle = colours.ahead;
@@ -250,42 +270,40 @@ export class Scene {
       const chosen = agent.id === selected;
       const level = cycle.agents.level[row];
       const measured = cycle.agents.length_m[row] !== null && cycle.agents.width_m[row] !== null;
-      this.#outline(agent, cycle.agents, camera);
+      this.#outline(agent, camera);
       context.fillStyle = level === "good" ? colours.agent : colours["agent-light"];
       context.strokeStyle = chosen ? colours.chosen : colours.agent;
       context.lineWidth = chosen ? 3 : 1.4;
+      const guessed = !measured && !agent.dot;
+      context.globalAlpha = guessed ? 0.4 : 1;
       context.fill();
-      if (!measured) context.setLineDash([3, 2]);
+      context.globalAlpha = 1;
+      if (guessed) context.setLineDash([4, 3]);
       context.stroke();
       context.setLineDash([]);
       if (level === "bad") this.#cross(agent);
       if (chosen) {
         context.beginPath();
-        context.arc(agent.px, agent.py, 15, 0, 2 * Math.PI);
+        context.arc(agent.px, agent.py, Math.max(agent.long, 9) + 5, 0, 2 * Math.PI);
         context.lineWidth = 1.5;
         context.stroke();
       }
     }
   }
 
-  /** The path of an agent's box, or of a dot with a nose where little is known. */
-  #outline(agent, columns, camera) {
+  /** The path of an agent's box, or of a dot with a nose. */
+  #outline(agent, camera) {
     const { context } = this;
-    const usual = SIZES[columns.kind[agent.row]];
-    const length = columns.length_m[agent.row] ?? usual?.[0];
-    const width = columns.width_m[agent.row] ?? usual?.[1];
     context.beginPath();
-    if (length === undefined || width === undefined || agent.heading === null) {
-      const radius = Math.max(LEAST_PX / 2, DOT_M * camera.scale);
-      context.arc(agent.px, agent.py, radius, 0, 2 * Math.PI);
-      if (agent.heading !== null) {
-        const angle = -(agent.heading + camera.turn);
-        context.moveTo(agent.px + radius * Math.cos(angle), agent.py + radius * Math.sin(angle));
-        context.lineTo(agent.px + 1.8 * radius * Math.cos(angle), agent.py + 1.8 * radius * Math.sin(angle));
-      }
-      return;
-    }
-    box(context, agent, length, width, camera);
+    if (!agent.dot) return box(context, agent, camera);
+    const { px, py, long: radius } = agent;
+    context.arc(px, py, radius, 0, 2 * Math.PI);
+    if (agent.heading === null) return undefined;
+    const angle = -(agent.heading + camera.turn);
+    const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
+    context.moveTo(px + radius * cos, py + radius * sin);
+    context.lineTo(px + 1.8 * radius * cos, py + 1.8 * radius * sin);
+    return undefined;
   }
 
   #cross({ px, py }) {
@@ -302,11 +320,14 @@ export class Scene {
 
   #drawEgo(moment, camera) {
     const pose = egoAt(moment);
+    this.ego = null;
     if (!pose) return;
     const { context, colours } = this;
     const [px, py] = camera.pixels(pose[0], pose[1]);
     context.beginPath();
-    box(context, { px, py, heading: pose[2] }, ...EGO_M, camera);
+    const [long, wide] = EGO_M.map((metres) => Math.max(LEAST_PX, metres * camera.scale) / 2);
+    this.ego = [px - long, py - wide, px + long, py + wide];
+    box(context, { px, py, heading: pose[2], long, wide }, camera);
     context.fillStyle = colours.ego;
     context.fill();
     context.strokeStyle = colours.ground;
@@ -371,9 +392,7 @@ function between(from, to, part) {
 }
 
 /** Path of a box seen from above, its front a little pointed. */
-function box(context, { px, py, heading }, length, width, camera) {
-  const long = Math.max(LEAST_PX * 1.6, length * camera.scale) / 2;
-  const wide = Math.max(LEAST_PX, width * camera.scale) / 2;
+function box(context, { px, py, heading, long, wide }, camera) {
   const angle = -(heading + camera.turn);
   const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
   const at = (ahead, aside) => [px + cos * ahead - sin * aside, py + sin * ahead + cos * aside];

@@ -2,14 +2,16 @@
 
 const SIGNS = [
   ["ego vehicle", (c, k) => car(c, k.ego, true)],
-  ["agent; measured size", (c, k) => car(c, k.agent, true)],
+  ["agent, as large as measured", (c, k) => car(c, k.agent, true)],
   ["seen for less than 2 s", (c, k) => car(c, k.agent, false)],
-  ["size not measured", (c, k) => car(c, k.agent, true, [3, 2])],
+  ["size not measured", (c, k) => car(c, k.agent, true, [4, 3])],
+  ["neither size nor class measured", (c, k) => dot(c, k.agent)],
   ["where it was, 2 s", (c, k) => line(c, k.past, 1.5)],
   ["predicted; fainter = less probable", (c, k) => line(c, k.ahead, 2.5)],
   ["predicted 1, 2, 3 s ago for now", (c, k) => diamond(c, k.ghost)],
   ["selected: constant velocity", (c, k) => line(c, k.straight, 2, [2, 4])],
-  ["selected: usual error after 1, 2, 3 s", (c, k) => circle(c, k.ahead)],
+  ["selected: usual error at 1, 2, 3 s", (c, k) => circle(c, k.ahead)],
+  ["half of the outcomes, if the model says", (c, k) => ellipse(c, k.ahead)],
 ];
 
 /** Fills the list; again when colours change. */
@@ -33,7 +35,9 @@ function car(c, colour, filled, dash = []) {
   c.setLineDash(dash);
   c.fillStyle = c.strokeStyle = colour;
   c.lineWidth = 1.4;
-  if (filled && !dash.length) c.fill();
+  c.globalAlpha = dash.length ? 0.4 : 1;
+  if (filled) c.fill();
+  c.globalAlpha = 1;
   c.stroke();
 }
 
@@ -65,4 +69,19 @@ function circle(c, colour) {
   c.beginPath();
   c.arc(22, 9, 7.5, 0, 2 * Math.PI);
   c.stroke();
+}
+
+function ellipse(c, colour) {
+  c.fillStyle = colour;
+  c.globalAlpha = 0.3;
+  c.beginPath();
+  c.ellipse(22, 9, 14, 6, 0, 0, 2 * Math.PI);
+  c.fill();
+}
+
+function dot(c, colour) {
+  c.fillStyle = colour;
+  c.beginPath();
+  c.arc(22, 9, 5, 0, 2 * Math.PI);
+  c.fill();
 }

@@ -13,24 +13,28 @@ import urllib.request
 from pathlib import Path
 from typing import Any, Self
 
-from conformance.environments import need
-
 PATIENCE_S = 60.0
+PROGRAMS = ("chromium", "chromedriver")
 _ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # how WebDriver calls a reference to an element
 _OPTIONS = (
     "--headless=new",
     "--no-sandbox",  # which root has not; it shows pages of this checkout only
     "--disable-dev-shm-usage",
     "--disable-gpu",
-    "--window-size=1050,1000",
 )
+
+KEYS = {"Escape": "\ue00c", "ArrowLeft": "\ue012", "ArrowRight": "\ue014", "Tab": "\ue004"}
+"""How WebDriver writes keys that are no letters."""
 
 
 class Browser:
     """A session, for as long as its `with` block."""
 
+    def __init__(self, *more: str, size: tuple[int, int] = (1050, 1000)) -> None:
+        """`more`: options of Chromium's. `size`: of the window, in pixels."""
+        self._options = [*_OPTIONS, f"--window-size={size[0]},{size[1]}", *more]
+
     def __enter__(self) -> Self:
-        need("chromium", "chromedriver")
         self._driver = subprocess.Popen(
             ["chromedriver", "--port=0"],
             stdout=subprocess.PIPE,
@@ -43,11 +47,18 @@ class Browser:
         )
         port = next(match[1] for match in ports if match)
         self._url = f"http://127.0.0.1:{port}/session"
-        options = {"binary": shutil.which("chromium"), "args": _OPTIONS}
-        wanted = {"browserName": "chrome", "goog:chromeOptions": options}
+        options = {"binary": shutil.which("chromium"), "args": self._options}
+        wanted = {
+            "browserName": "chrome",
+            "goog:chromeOptions": options,
+            "goog:loggingPrefs": {"browser": "ALL"},
+        }
         session = self._ask("POST", "", {"capabilities": {"alwaysMatch": wanted}})
         self._url += f"/{session['sessionId']}"
-        self.version = str(session["capabilities"]["browserVersion"])
+        capabilities = session["capabilities"]
+        self.version = str(capabilities["browserVersion"])
+        self.pid = int(capabilities["goog:processID"])
+        """Of the browser, the parent of all its processes."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -62,6 +73,45 @@ class Browser:
     def click(self, selector: str) -> None:
         """Click an element, as a person would."""
         self._ask("POST", f"/element/{self._find(selector)}/click", {})
+
+    def press(self, *keys: str) -> None:
+        """Press keys one after the other: letters, or names of KEYS."""
+        strokes = [KEYS.get(key, key) for key in keys]
+        actions = [{"type": kind, "value": key} for key in strokes for kind in ("keyDown", "keyUp")]
+        self._ask("POST", "/actions", {"actions": [{"type": "key", "id": "k", "actions": actions}]})
+
+    def click_at(self, x: float, y: float) -> None:
+        """Click a point of the page, in pixels from its corner."""
+        pointer = [
+            {"type": "pointerMove", "duration": 0, "x": round(x), "y": round(y)},
+            {"type": "pointerDown", "button": 0},
+            {"type": "pointerUp", "button": 0},
+        ]
+        self._ask(
+            "POST", "/actions", {"actions": [{"type": "pointer", "id": "p", "actions": pointer}]}
+        )
+
+    def console(self) -> list[str]:
+        """Warnings and errors that the page has caused since this was asked last."""
+        entries = self._ask("POST", "/se/log", {"type": "browser"})
+        return [one["message"] for one in entries if one["level"] in {"WARNING", "SEVERE"}]
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the page so many pixels."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self._cdp("Emulation.setDeviceMetricsOverride", size)
+
+    def emulate(self, **features: str) -> None:
+        """What the page is told that its reader prefers, such as `prefers_color_scheme="dark"`."""
+        named = [{"name": k.replace("_", "-"), "value": v} for k, v in features.items()]
+        self._cdp("Emulation.setEmulatedMedia", {"features": named})
+
+    def see_as(self, deficiency: str) -> None:
+        """As a reader sees it who is colour-blind, in Chromium's words; "none" is as before."""
+        self._cdp("Emulation.setEmulatedVisionDeficiency", {"type": deficiency})
+
+    def _cdp(self, command: str, parameters: object) -> None:
+        self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
 
     def wait_for(self, selector: str, pattern: str, problem: str) -> str:
         """The element's text, once `pattern` is in it. Raises if `problem` has any text."""
