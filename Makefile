@@ -59,7 +59,7 @@ soak: $(RUNTIME_VENV)/.installed ## a simulated day and a real hour of traffic, 
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m soak.run
 
 clean: ## remove the environments and everything else that was made here
-	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance
+	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance .artifacts
 	rm -rf deploy/examples/build deploy/examples/javascript/node_modules
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

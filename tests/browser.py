@@ -91,6 +91,16 @@ class Browser:
             "POST", "/actions", {"actions": [{"type": "pointer", "id": "p", "actions": pointer}]}
         )
 
+    def drag(self, x: float, y: float, to_x: float, to_y: float) -> None:
+        """Drag from one point of the page to another."""
+        moves = [
+            {"type": "pointerMove", "duration": 0, "x": round(x), "y": round(y)},
+            {"type": "pointerDown", "button": 0},
+            {"type": "pointerMove", "duration": 50, "x": round(to_x), "y": round(to_y)},
+            {"type": "pointerUp", "button": 0},
+        ]
+        self._ask("POST", "/actions", {"actions": [{"type": "pointer", "id": "p", "actions": moves}]})
+
     def console(self) -> list[str]:
         """Warnings and errors that the page has caused since this was asked last."""
         entries = self._ask("POST", "/se/log", {"type": "browser"})

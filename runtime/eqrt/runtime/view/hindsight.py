@@ -23,7 +23,7 @@ Float64 = NDArray[np.float64]
 LOOK_BACK_S = (1, 2, 3)
 WINDOW_S = 60.0
 """What the running score speaks of."""
-_NEAR_S = 0.1  # between a cycle and the moment looked for
+_NEAR_S = 0.06  # between a cycle and the moment looked for
 _KEPT_S = max(LOOK_BACK_S) + 2 * _NEAR_S
 
 

@@ -107,7 +107,7 @@ function aim(moment) {
   let at = ego;
   const row = moment.cycle.rows.get(page.selected);
   if (camera.follow === "selected" && row !== undefined) at = agentPlace(moment, row);
-  if (!at && camera.follow === "ego" && !camera.placed) at = middleOf(moment.cycle);
+  if (!at && camera.follow === "ego") at = traffic(moment.cycle);
   camera.placed = Boolean(at) || camera.placed;
   const [x, y] = at ?? [camera.x, camera.y];
   camera.lookAt(x, y, page.yaw);
@@ -124,9 +124,12 @@ function agentPlace({ cycle, next, part }, row) {
   return [x + part * (nx - x), y + part * (ny - y)];
 }
 
-/** Of a file that does not tell where the ego vehicle is: its traffic. */
-function middleOf(cycle) {
-  return cycle.count ? cycle.origin : null;
+/** Where nobody tells the place of the ego vehicle: slowly to the middle of the traffic. */
+function traffic(cycle) {
+  if (!cycle.count || page.yaw !== null) return null; // it is known but for a moment
+  const [x, y] = cycle.origin;
+  const near = camera.placed && Math.hypot(x - camera.x, y - camera.y) < 200;
+  return near ? [camera.x + 0.03 * (x - camera.x), camera.y + 0.03 * (y - camera.y)] : [x, y];
 }
 
 // Panels
@@ -139,10 +142,12 @@ function panels() {
     connected: page.connected, hello: page.hello, moment, silent,
     status: page.statuses.at(-1), waiting: now - page.opened,
   });
-  showService(page.statuses, moment, page.trouble ? [page.trouble] : [], scene.colours);
+  showService(page.statuses, moment, timeline.mode, page.trouble ? [page.trouble] : [], scene.colours);
   showScore(moment?.cycle.score ?? null);
   showSelected(moment, page.selected);
   showTransport(timeline);
+  sayTurn();
+  sayFollow();
 }
 
 function showTransport(timeline) {
@@ -183,7 +188,6 @@ const actions = {
   farther: () => camera.zoom(0.8),
   turn: () => {
     camera.axis = TURNS[(TURNS.indexOf(camera.axis) + 1) % TURNS.length];
-    sayTurn();
   },
   follow: () => follow(nextToFollow()),
   ghosts: () => {
@@ -204,7 +208,8 @@ const keys = {
 
 function sayTurn() {
   const words = { up: "Heading up", right: "Heading right", north: "North up" };
-  set("turn", words[camera.axis]);
+  set("turn", page.yaw === null ? words.north : words[camera.axis]);
+  by("turn").disabled = page.yaw === null;
 }
 
 function nextToFollow() {
@@ -217,8 +222,13 @@ function follow(whom) {
   if (camera.follow !== whom && whom === "free") camera.pan(0, 0);
   camera.follow = whom;
   camera.placed = false;
-  const words = { ego: "Following ego", selected: "Following selected", free: "Not following" };
-  set("follow", words[whom]);
+  sayFollow();
+}
+
+function sayFollow() {
+  const ego = page.yaw === null ? "Following traffic" : "Following ego";
+  const words = { ego, selected: "Following selected", free: "Not following" };
+  set("follow", words[camera.follow]);
 }
 
 function select(id) {
@@ -286,7 +296,7 @@ canvas.onpointermove = (event) => {
   drag.moved += Math.abs(dx) + Math.abs(dy);
   if (drag.moved > 4) {
     camera.pan(dx, dy);
-    set("follow", "Not following");
+    sayFollow();
     canvas.classList.add("dragging");
   }
   [drag.x, drag.y] = [event.offsetX, event.offsetY];
@@ -310,7 +320,6 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", dress);
 new ResizeObserver(() => scene.resize(camera)).observe(canvas);
 
 scene.resize(camera);
-sayTurn();
 dress();
 setInterval(panels, PANELS_MS);
 panels();
@@ -333,6 +342,7 @@ window.eqrt = {
   get lanes() { return page.moment?.cycle.on_map ? scene.lanes?.lanes.length ?? 0 : 0; },
   get labels() { return scene.labels.boxes ?? []; },
   get pixels() { return scene.agents.map(({ id, px, py }) => ({ id, px, py })); },
+  get camera() { return { scale: camera.scale, follow: camera.follow, axis: camera.axis }; },
   get connected() { return page.connected; },
   get bytes() { return stream.bytes; },
   get updates() { return stream.updates; },

@@ -57,7 +57,7 @@ function showNotice({ connected, hello, moment, waiting }) {
 }
 
 /** Latency, rates and what went wrong, over the minute before the moment. */
-export function showService(statuses, moment, troubles, colours) {
+export function showService(statuses, moment, mode, troubles, colours) {
   const now = moment?.time ?? statuses.at(-1)?.time_s ?? 0;
   const heard = statuses.filter((s) => s.time_s <= now + 1.5 && s.time_s > now - 61);
   const points = heard.flatMap((s) =>
@@ -69,12 +69,13 @@ export function showService(statuses, moment, troubles, colours) {
   drawSpark(by("spark"), points, colours);
   const values = points.map((point) => point[1]);
   drawHistogram(by("histogram"), values, colours);
-  set("service-words", serviceWords(status, values));
+  set("service-words", serviceWords(status, values, mode));
   showNumbers("service-numbers", status ? serviceNumbers(status, values) : []);
   showTroubles([...troubles, ...serviceTroubles(status)]);
 }
 
-function serviceWords(status, values) {
+function serviceWords(status, values, mode) {
+  if (!status && mode === "file") return "The file says nothing about the service itself.";
   if (!status) return "The service has said nothing about itself.";
   if (!values.length) return "No predictions in the last minute.";
   return "From the last message of a cycle to its predictions sent:";

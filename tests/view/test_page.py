@@ -1,0 +1,327 @@
+"""The page in Chromium, with real services behind it. Screenshots stay in `.artifacts/`."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from browser import Browser
+from crowd import crowd, cycles
+from drives import DEMO, DRIVES, Drive
+from eqrt.runtime.bus.buses import LOCAL
+from eqrt.runtime.output.datagrams import DatagramPublisher
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.json_lines import json_lines
+from processes import PATIENCE_S, Heard, Serving, playing
+from viewing import CHANNELS, Viewing, artifact
+
+LOGS = {"ngsim": DRIVES["ngsim"].log, "rav4": DEMO / "rav4.log.gz"}
+
+
+@contextlib.contextmanager
+def watched(drive: Drive, log: Path) -> Iterator[tuple[Viewing, Heard, Serving]]:
+    """The demo's recording played in a loop to a service that a view and a listener follow."""
+    channel = next(CHANNELS)
+    can = ["--can", channel, "--can-interface", LOCAL]
+    with contextlib.ExitStack() as stack:
+        viewing = stack.enter_context(Viewing())
+        heard = stack.enter_context(Heard(channel, []))
+        to = [f"--datagrams={address}" for address in (viewing.datagrams, heard.address)]
+        serving = stack.enter_context(Serving(*can, *drive.options, *to, "--quiet"))
+        stack.enter_context(playing(log, "--can", channel, "--loop"))
+        yield viewing, heard, serving
+
+
+@pytest.fixture(scope="module")
+def ngsim() -> Iterator[tuple[Viewing, Heard, Serving]]:
+    with watched(DRIVES["ngsim"], LOGS["ngsim"]) as all_of_it:
+        yield all_of_it
+
+
+@contextlib.contextmanager
+def sending(viewing: Viewing, change: Callable[[ForecastSet], ForecastSet]) -> Iterator[None]:
+    """The crowd's cycles, changed, in a thread."""
+    import threading
+
+    ended = threading.Event()
+
+    def send() -> None:
+        with DatagramPublisher([viewing.datagrams]) as publisher:
+            for forecast in cycles(8):
+                if ended.is_set():
+                    return
+                publisher.publish(change(forecast))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def shown(browser: Browser, name: str) -> Any:
+    """What the page says of itself."""
+    return browser.evaluate(f"return window.eqrt && window.eqrt.{name}")
+
+
+def wait(browser: Browser, condition: str) -> None:
+    """Until a JavaScript expression, with the page's `e`, is true."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not browser.evaluate(f"const e = window.eqrt; return Boolean(e && ({condition}))"):
+        said = browser.evaluate("return document.body.innerText")
+        assert time.monotonic() < end_s, f"{condition} never came true; the page says {said!r}"
+        time.sleep(0.1)
+
+
+def text(browser: Browser, selector: str) -> str:
+    return str(browser.evaluate(f"return document.querySelector('{selector}').innerText"))
+
+
+def test_traffic_with_a_map_is_shown_and_moves(
+    browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
+) -> None:
+    browser.open(ngsim[0].address)
+    wait(browser, "e.agents.length > 15 && e.ghosts > 10 && e.score && e.lanes > 0")
+    assert shown(browser, "words") == "Full service: model, map and ego motion"
+    before = {agent["id"]: agent for agent in shown(browser, "agents")}
+    time.sleep(1.0)
+    after = {agent["id"]: agent for agent in shown(browser, "agents")}
+    both = before.keys() & after.keys()
+    assert len(both) > 10
+    moved_m = [
+        abs(after[i]["x"] - before[i]["x"]) + abs(after[i]["y"] - before[i]["y"]) for i in both
+    ]
+    assert sum(metres > 3.0 for metres in moved_m) > 5
+    assert "ms" in text(browser, "#service-numbers")
+    assert "constant velocity" in text(browser, "#score-table")
+    assert "profile generic" in text(browser, "#what")
+    browser.screenshot(artifact("view-with-a-map.png"))
+    assert browser.console() == []
+
+
+def test_agents_are_where_the_service_said(
+    browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
+) -> None:
+    """Paused, so that nobody is on the way from one cycle to the next."""
+    viewing, heard, _ = ngsim
+    browser.open(viewing.address)
+    wait(browser, "e.agents.length > 5 && e.kept > 5")
+    browser.click("#play")
+    wait(browser, "e.paused")
+    moment = shown(browser, "moment")
+    agents = {agent["id"]: agent for agent in shown(browser, "agents")}
+    said = next(one for one in heard.forecasts if one.cycle == moment["cycle"])
+    assert agents.keys() == set(said.track_id.tolist())
+    for track_id, position in zip(said.track_id.tolist(), said.position.tolist(), strict=True):
+        assert (agents[track_id]["x"], agents[track_id]["y"]) == pytest.approx(position, abs=0.02)
+
+
+def test_pause_holds_the_picture_and_steps_go_through_the_last_minute(
+    browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
+) -> None:
+    browser.open(ngsim[0].address)
+    wait(browser, "e.live && e.kept > 30")
+    browser.press("p")
+    wait(browser, "e.paused && !e.live")
+    held = shown(browser, "agents")
+    cycle = shown(browser, "moment")["cycle"]
+    kept = shown(browser, "kept")
+    wait(browser, f"e.kept > {kept} + 3 || e.kept > 590")  # the world goes on
+    assert shown(browser, "agents") == held
+    browser.press("ArrowLeft", "ArrowLeft")
+    wait(browser, f"e.moment.cycle === {cycle - 2}")
+    assert shown(browser, "agents") != held
+    browser.press("ArrowRight")
+    wait(browser, f"e.moment.cycle === {cycle - 1}")
+    assert "s ago" in text(browser, "#when")
+    assert text(browser, "#play") == "Play"
+    browser.screenshot(artifact("view-paused.png"))
+    browser.evaluate(
+        "const s = document.getElementById('scrub'); s.value = 0; s.dispatchEvent(new Event('input'))"
+    )
+    wait(browser, f"e.moment.cycle < {cycle - 15}")
+    browser.press("l")
+    wait(browser, f"e.live && !e.paused && e.moment.cycle > {cycle}")
+    assert browser.console() == []
+
+
+def test_a_click_selects_an_agent_and_shows_its_numbers(
+    browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
+) -> None:
+    browser.open(ngsim[0].address)
+    wait(browser, "e.agents.length > 5 && e.ghosts > 10")
+    browser.press("p")
+    wait(browser, "e.paused")
+    agent = browser.evaluate(
+        "const box = document.getElementById('scene').getBoundingClientRect();"
+        "const inside = window.eqrt.pixels.filter(a => a.px > 200 && a.px < box.width - 200"
+        "  && a.py > 100 && a.py < box.height - 100);"
+        "const a = inside[0]; return { id: a.id, x: a.px + box.left, y: a.py + box.top }"
+    )
+    browser.click_at(agent["x"], agent["y"])
+    wait(browser, "e.selected !== null")
+    chosen = shown(browser, "selected")
+    assert chosen in {a["id"] for a in shown(browser, "agents")}
+    panel = text(browser, "#selected")
+    for words in (f"{chosen}, car", "m/s", "from ego", "by the model", "path 1", "100 %"):
+        assert words in panel
+    browser.screenshot(artifact("view-selected.png"))
+    browser.press("Escape")
+    wait(browser, "e.selected === null")
+    assert text(browser, "#selected") == ""
+    assert browser.console() == []
+
+
+def test_no_label_lies_on_another(browser: Browser, ngsim: tuple[Viewing, Heard, Serving]) -> None:
+    browser.open(ngsim[0].address)
+    wait(browser, "e.labels.length > 8")
+    boxes = shown(browser, "labels")
+    for a, b in itertools.combinations(boxes, 2):
+        assert not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3])
+
+
+def test_wheel_drag_and_keys_move_the_view(
+    browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
+) -> None:
+    browser.open(ngsim[0].address)
+    wait(browser, "e.agents.length > 5")
+    scale = shown(browser, "camera")["scale"]
+    browser.press("+")
+    wait(browser, f"e.camera.scale > {scale}")
+    assert shown(browser, "camera")["follow"] == "ego"
+    browser.drag(400, 300, 460, 320)
+    wait(browser, "e.camera.follow === 'free'")
+    browser.press("f")
+    wait(browser, "e.camera.follow === 'ego'")
+    assert shown(browser, "camera")["axis"] == "right"
+    browser.press("n")
+    wait(browser, "e.camera.axis === 'up'")
+
+
+def test_traffic_without_a_map_says_so(browser: Browser) -> None:
+    with watched(DRIVES["rav4"], LOGS["rav4"]) as (viewing, _, _):
+        browser.open(viewing.address)
+        wait(browser, "e.agents.length > 2 && e.words.includes(' for ')")
+        assert shown(browser, "words").startswith("No map here: predicting without lanes, for ")
+        assert shown(browser, "lanes") == 0
+        assert "no map" in text(browser, "#what")
+        browser.screenshot(artifact("view-without-a-map.png"))
+        assert browser.console() == []
+
+
+def test_a_stopped_browser_leaves_the_service_as_it_is(ngsim: tuple[Viewing, Heard, Serving]) -> None:
+    viewing, heard, _ = ngsim
+    with Browser() as victim:
+        victim.open(viewing.address)
+        wait(victim, "e.agents.length > 5")
+        children = [int(pid) for pid in descendants(victim.pid)]
+        for pid in children:
+            os.kill(pid, signal.SIGSTOP)
+        before = len(heard.forecasts)
+        time.sleep(4.0)
+        came = len(heard.forecasts) - before
+        for pid in children:
+            os.kill(pid, signal.SIGCONT)
+        assert 30 < came < 50  # 10 a second
+        wait(victim, f"e.live && e.moment.cycle > {heard.forecasts[-1].cycle - 30}")
+
+
+def descendants(pid: int) -> list[int]:
+    """A process and all that it has started."""
+    below = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [pid, *(one for child in below for one in descendants(int(child)))]
+
+
+def test_before_anything_comes_it_says_what_to_run_and_goes_on_by_itself(browser: Browser) -> None:
+    with Viewing() as viewing:
+        browser.open(viewing.address)
+        wait(browser, "e.words === 'Waiting for predictions'")
+        wait(browser, "!document.getElementById('notice').hidden")
+        assert f"--datagrams {viewing.datagrams}" in text(browser, "#notice")
+        browser.screenshot(artifact("view-waiting.png"))
+        with sending(viewing, lambda forecast: forecast):
+            wait(browser, "e.agents.length === 8")
+            wait(browser, "document.getElementById('notice').hidden")
+        wait(browser, "e.words.startsWith('Nothing heard of the service for ')")
+    wait(browser, "e.words === 'Connection to eqrt view lost'")
+    assert "eqrt view" in text(browser, "#notice")
+    browser.screenshot(artifact("view-connection-lost.png"))
+    port = int(viewing.host.rpartition(":")[2])
+    with Viewing(port=port):
+        wait(browser, "e.connected")
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        (Mode.NO_POSE, "No map pose: predicting without lanes"),
+        (Mode.LATE, "Late: predicting took longer than one period"),
+        (Mode.FALLBACK, "Without the model: constant turn rate and speed"),
+        (Mode.SILENT, "No input from the sensor: earlier predictions are void"),
+    ],
+)
+def test_what_the_service_cannot_do_is_said_in_words(
+    browser: Browser, mode: Mode, words: str
+) -> None:
+    def change(forecast: ForecastSet) -> ForecastSet:
+        if mode is Mode.SILENT:
+            forecast = forecast.targets(slice(0))
+        elif mode is Mode.FALLBACK:
+            forecast.agent_mode[:] = Mode.FALLBACK
+        return replace(forecast, mode=mode)
+
+    with Viewing() as viewing, sending(viewing, change):
+        browser.open(viewing.address)
+        wait(browser, f"e.words.startsWith({words!r})")
+        browser.screenshot(artifact(f"view-{mode.name.lower()}.png"))
+
+
+def test_a_file_plays_pauses_and_can_be_gone_through(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "replayed.jsonl"
+    path.write_bytes(b"".join(json_lines(crowd(cycle, 8)) for cycle in range(300)))
+    with Viewing(str(path)) as viewing:
+        browser.open(viewing.address)
+        wait(browser, "e.kept === 300 && e.moment && e.moment.time_s > 0.5")
+        assert "of 0:29.9" in text(browser, "#when")
+        assert not shown(browser, "paused")
+        browser.press("p")
+        wait(browser, "e.paused")
+        browser.evaluate(
+            "const s = document.getElementById('scrub'); s.value = 800;"
+            "s.dispatchEvent(new Event('input'))"
+        )
+        wait(browser, "Math.abs(e.moment.time_s - 23.9) < 0.2 && e.agents.length === 8")
+        wait(browser, "e.ghosts > 3 && e.score !== null")
+        cycle = shown(browser, "moment")["cycle"]
+        browser.press("ArrowRight")
+        wait(browser, f"e.moment.cycle === {cycle} + 1")
+        browser.press("l")
+        wait(browser, "e.moment.cycle === 299")
+        browser.screenshot(artifact("view-file.png"))
+        assert browser.console() == []
+
+
+def test_dark_and_narrow(browser: Browser, ngsim: tuple[Viewing, Heard, Serving]) -> None:
+    """Nothing is cut off sideways, and colours are those of the dark."""
+    browser.emulate(prefers_color_scheme="dark")
+    browser.resize(800, 1000)
+    browser.open(ngsim[0].address)
+    wait(browser, "e.agents.length > 5")
+    browser.screenshot(artifact("view-dark-narrow.png"))
+    assert browser.evaluate("return document.documentElement.scrollWidth <= innerWidth")
+    shade = browser.evaluate("return getComputedStyle(document.body).backgroundColor")
+    assert shade == "rgb(20, 24, 27)"
+    browser.emulate(prefers_color_scheme="light")
+    browser.resize(1280, 720)
+    assert browser.console() == []

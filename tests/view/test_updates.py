@@ -1,0 +1,179 @@
+"""What pages are told, byte for byte, and in words."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crowd import crowd
+from drives import TILE
+from eqrt.core.errors import LogError
+from eqrt.core.frames import Pose2
+from eqrt.core.metrics import LENGTH_OF_SHARE
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.json_lines import json_lines
+from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.view.hindsight import Hindsight
+from eqrt.runtime.view.recorded import read_records
+from eqrt.runtime.view.updates import STEP_M, course_rad, decode_update, encode_update
+from eqrt.runtime.view.watch import Lanes, Watch
+from eqrt.runtime.view.words import DROPS, LEVELS, drops, mode_words
+from forecast_sets import many, nobody, one_car
+
+
+def update_of(forecast: ForecastSet) -> bytes:
+    ghosts = Hindsight().add(forecast)
+    return encode_update(forecast, ghosts=ghosts, score=None, stream=0, mode_since_s=0.0)
+
+
+def test_places_come_back_to_a_centimetre() -> None:
+    forecast = many(40)
+    head, places = decode_update(update_of(forecast))
+    assert head["shape"] == [40, 20, 6, 30]
+    for name in ("position", "history", "trajectories"):
+        np.testing.assert_allclose(places[name], getattr(forecast, name), atol=STEP_M / 2 + 1e-6)
+    assert np.isnan(places["ghosts"]).all()
+    assert head["agents"]["track_id"] == forecast.track_id.tolist()
+    assert head["agents"]["probabilities"][7] == pytest.approx(forecast.probabilities[7], abs=1e-3)
+
+
+def test_64_agents_with_6_modes_take_no_more_than_they_say() -> None:
+    assert len(update_of(crowd(0, 64))) < 75_000  # 58,000 for places
+
+
+def test_what_is_not_known_is_null_and_no_place() -> None:
+    head, places = decode_update(update_of(one_car()))
+    agents = head["agents"]
+    assert agents["width_m"] == [None]
+    assert agents["length_m"] == [4.5]
+    assert agents["ellipses"] is None
+    assert head["score"] is None
+    np.testing.assert_array_equal(np.isnan(places["history"][0, :, 0]), np.arange(20) < 13)
+
+
+def test_what_lies_too_far_out_is_no_place_rather_than_a_wrong_one() -> None:
+    forecast = one_car()
+    forecast.trajectories[0, 1, 20:] += 1e5
+    _, places = decode_update(update_of(forecast))
+    assert np.isnan(places["trajectories"][0, 1, 20:]).all()
+    assert not np.isnan(places["trajectories"][0, 1, :20]).any()
+
+
+def test_a_cycle_without_an_ego_pose_tells_none() -> None:
+    silent = replace(nobody(), map_from_ego=Pose2(), ego_speed_mps=math.nan)
+    head, _ = decode_update(update_of(silent))
+    assert head["ego"] is None
+    assert head["level"] == "bad"
+    standing = replace(one_car(), ego_speed_mps=0.0)
+    assert decode_update(update_of(standing))[0]["ego"] == pytest.approx([100, 200, math.pi / 2])
+
+
+def test_a_heading_is_measured_or_where_it_drives_to_or_not_known() -> None:
+    forecast = replace(many(3), heading_rad=np.array([0.5, np.nan, np.nan]))
+    forecast.velocity[1] = (0.0, -3.0)
+    forecast.velocity[2] = (0.1, 0.1)
+    np.testing.assert_allclose(course_rad(forecast), [0.5, -math.pi / 2, np.nan])
+
+
+def test_an_ellipse_holds_half_of_the_distribution() -> None:
+    forecast = one_car()
+    along, across = 3.0, 0.75
+    covariances = np.zeros((1, 2, 30, 2, 2))
+    covariances[..., 0, 0], covariances[..., 1, 1] = across, along
+    head, _ = decode_update(update_of(replace(forecast, covariances=covariances)))
+    long, short, angle = head["agents"]["ellipses"][0][0]
+    assert long == pytest.approx(LENGTH_OF_SHARE[50] * math.sqrt(along / 3), abs=1e-3)
+    assert short == pytest.approx(LENGTH_OF_SHARE[50] * math.sqrt(across / 3), abs=1e-3)
+    assert abs(math.sin(angle)) == pytest.approx(1.0)  # it drives north
+
+
+def test_every_mode_has_words_and_a_level() -> None:
+    words = {mode_words(mode, 3) for mode in Mode if mode is not Mode.PARTIAL}
+    assert len(words) == len(Mode) - 1
+    assert not any(mode.name in text for text in words for mode in Mode)
+    assert set(LEVELS) == set(Mode)
+    assert mode_words(Mode.NO_POSE, 0) == "No ego motion: nothing is predicted"
+    assert mode_words(Mode.NO_POSE, 4) == "No map pose: predicting without lanes"
+
+
+def test_only_what_went_wrong_is_told() -> None:
+    assert drops({"can_failed": 0, "can_sent": 7, "tracks_dropped": 2}) == {
+        DROPS["tracks_dropped"]: 2
+    }
+
+
+def test_lanes_are_told_around_the_ego_vehicle_and_again_when_it_has_driven_on() -> None:
+    tile = load_tile(TILE)
+    lanes = Lanes(tile)
+    assert lanes.near(one_car()) is None  # predicted without a map
+    x_m, y_m = tile.lane_map.lane_points(0)[0].tolist()
+
+    def there(ahead_m: float) -> ForecastSet:
+        pose = Pose2(x_m + ahead_m, y_m, 0.0)
+        return replace(one_car(), tile_id="e66f7853", mode=Mode.RUN, map_from_ego=pose)
+
+    first = lanes.near(there(0.0))
+    assert first is not None
+    told = json.loads(first)
+    points = np.array(told["lanes"][0]).reshape(-1, 2) / 100.0 + told["origin"]
+    np.testing.assert_allclose(points, tile.lane_map.lane_points(0), atol=0.01)
+    assert lanes.near(there(150.0)) is None
+    assert lanes.near(replace(there(300.0), mode=Mode.NO_POSE)) is None
+    again = lanes.near(there(300.0))
+    assert again is not None
+    assert json.loads(again)["number"] == told["number"] + 1
+
+
+def test_a_replayed_file_is_what_the_service_said(tmp_path: Path) -> None:
+    path = tmp_path / "some.jsonl"
+    said = [crowd(cycle, 9) for cycle in range(30)]
+    path.write_bytes(b"".join(map(json_lines, said)))
+    found = [record for record in read_records(path) if isinstance(record, ForecastSet)]
+    assert [record.cycle for record in found] == list(range(30))
+    for one, other in zip(found, said, strict=True):
+        np.testing.assert_allclose(one.trajectories, other.trajectories, atol=1e-3)
+        np.testing.assert_array_equal(one.track_id, other.track_id)
+        assert one.mode is other.mode
+    last, true = found[-1], said[-1]
+    stayed = [i for i, track in enumerate(last.track_id) if track in said[0].track_id]
+    assert last.history_valid[stayed].all()
+    np.testing.assert_allclose(last.history[stayed], true.history[stayed], atol=2e-3)
+    assert not found[0].history_valid[:, :-1].any()
+    watch = Watch()
+    for record in found:
+        head, _ = decode_update(watch.update(record))
+    assert head["ego"] is None
+    assert head["agents"]["error_m"][stayed[0]][0] == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.log", b"", "not a file that can be watched"),
+        ("a.jsonl", b'{"cycle": 1}\n', ":1: not a line of `eqrt replay`"),
+        ("a.jsonl", b"\xff\n", ":1: not a line of `eqrt replay`"),
+        ("missing.jsonl", None, "no such file"),
+    ],
+)
+def test_a_file_that_cannot_be_watched_is_refused_in_one_line(
+    tmp_path: Path, name: str, content: bytes | None, said: str
+) -> None:
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(LogError) as refused:
+        list(read_records(path))
+    assert said in str(refused.value)
+    assert str(path) in str(refused.value)
+
+
+def test_a_cycle_whose_lines_do_not_fit_together_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    path.write_bytes(json_lines(crowd(0, 2)) + json_lines(replace(one_car(), cycle=0)))
+    with pytest.raises(LogError, match="cycle 0 cannot be used"):
+        list(read_records(path))
