@@ -9,7 +9,7 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table bench figures faults soak load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table bench figures view-figures faults soak load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -49,6 +49,9 @@ figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, mea
 
 load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a service, in 2 minutes; nothing may be lost
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60
+
+view-figures: $(VENV)/.installed ## print what watching costs: frames of the page, latency beside browsers
+	@PYTHONPATH=tests $(VENV)/bin/python tests/bench/view_figures.py
 
 faults: $(VENV)/.installed ## throw faults at messages, machine and model, then kill the service 100 times; in 6 minutes
 	FAULT_EXAMPLES=200 $(VENV)/bin/python -m pytest -q tests/faults/test_pipeline_machine.py

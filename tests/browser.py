@@ -66,6 +66,10 @@ class Browser:
         self._driver.terminate()
         self._driver.communicate(timeout=PATIENCE_S)
 
+    def processes(self) -> list[int]:
+        """The ids of all processes of the browser."""
+        return _family(self.pid)
+
     def open(self, url: str) -> None:
         """Load a page."""
         self._ask("POST", "/url", {"url": url})
@@ -99,7 +103,9 @@ class Browser:
             {"type": "pointerMove", "duration": 50, "x": round(to_x), "y": round(to_y)},
             {"type": "pointerUp", "button": 0},
         ]
-        self._ask("POST", "/actions", {"actions": [{"type": "pointer", "id": "p", "actions": moves}]})
+        self._ask(
+            "POST", "/actions", {"actions": [{"type": "pointer", "id": "p", "actions": moves}]}
+        )
 
     def console(self) -> list[str]:
         """Warnings and errors that the page has caused since this was asked last."""
@@ -158,3 +164,9 @@ class Browser:
                 return json.load(answer)["value"]
         except urllib.error.HTTPError as error:
             raise RuntimeError(f"chromedriver: {json.load(error)['value']['message']}") from error
+
+
+def _family(pid: int) -> list[int]:
+    """A process and all that it has started."""
+    below = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [pid, *(one for child in below for one in _family(int(child)))]

@@ -219,12 +219,14 @@ def test_traffic_without_a_map_says_so(browser: Browser) -> None:
         assert browser.console() == []
 
 
-def test_a_stopped_browser_leaves_the_service_as_it_is(ngsim: tuple[Viewing, Heard, Serving]) -> None:
+def test_a_stopped_browser_leaves_the_service_as_it_is(
+    ngsim: tuple[Viewing, Heard, Serving],
+) -> None:
     viewing, heard, _ = ngsim
     with Browser() as victim:
         victim.open(viewing.address)
         wait(victim, "e.agents.length > 5")
-        children = [int(pid) for pid in descendants(victim.pid)]
+        children = victim.processes()
         for pid in children:
             os.kill(pid, signal.SIGSTOP)
         before = len(heard.forecasts)
@@ -234,12 +236,6 @@ def test_a_stopped_browser_leaves_the_service_as_it_is(ngsim: tuple[Viewing, Hea
             os.kill(pid, signal.SIGCONT)
         assert 30 < came < 50  # 10 a second
         wait(victim, f"e.live && e.moment.cycle > {heard.forecasts[-1].cycle - 30}")
-
-
-def descendants(pid: int) -> list[int]:
-    """A process and all that it has started."""
-    below = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return [pid, *(one for child in below for one in descendants(int(child)))]
 
 
 def test_before_anything_comes_it_says_what_to_run_and_goes_on_by_itself(browser: Browser) -> None:
@@ -265,7 +261,7 @@ def test_before_anything_comes_it_says_what_to_run_and_goes_on_by_itself(browser
     ("mode", "words"),
     [
         (Mode.NO_POSE, "No map pose: predicting without lanes"),
-        (Mode.LATE, "Late: predicting took longer than one period"),
+        (Mode.LATE, "Late: predictions come late, or not all from the model"),
         (Mode.FALLBACK, "Without the model: constant turn rate and speed"),
         (Mode.SILENT, "No input from the sensor: earlier predictions are void"),
     ],

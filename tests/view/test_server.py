@@ -88,7 +88,10 @@ def test_texts_go_first_and_a_newer_one_replaces_an_older_one() -> None:
 
 def test_a_page_that_does_not_read_costs_a_few_updates_of_memory_and_the_others_nothing() -> None:
     async def test(server: ViewServer) -> None:
-        async with connect(stream_of(server), max_queue=1) as slow, connect(stream_of(server)) as quick:
+        async with (
+            connect(stream_of(server), max_queue=1) as slow,
+            connect(stream_of(server)) as quick,
+        ):
             for _ in range(3):  # hello and the past
                 await quick.recv()
             slow.transport.pause_reading()

@@ -28,7 +28,16 @@ from eqrt.runtime.view.keyboard import Keyboard
 from eqrt.runtime.view.live import Ear, Record, listen
 from eqrt.runtime.view.updates import ego_pose
 from eqrt.runtime.view.watch import Watch
-from eqrt.runtime.view.words import AGENT_BRIEF, BAD, GOOD, LEVELS, class_words, drops, mode_words
+from eqrt.runtime.view.words import (
+    AGENT_BRIEF,
+    AGENT_LEVELS,
+    BAD,
+    GOOD,
+    LEVELS,
+    class_words,
+    drops,
+    mode_words,
+)
 
 _REDRAW_S = 0.2
 _SILENT_S = 2.0
@@ -293,7 +302,7 @@ def _tracks(now: ForecastSet, ghosts: Ghosts) -> list[Track]:
             range_m=float(range_m[row]),
             speed_mps=float(speed_mps[row]),
             how=AGENT_BRIEF.get(modes[row], modes[row].name),
-            level=LEVELS[modes[row]],
+            level=AGENT_LEVELS.get(modes[row], GOOD),
             age_s=float(now.age_s[row]),
             errors_m=ghosts.error_m[row].tolist(),
         )

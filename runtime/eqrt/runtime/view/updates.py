@@ -21,6 +21,7 @@ from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.view.hindsight import LOOK_BACK_S, Ghosts, Score
 from eqrt.runtime.view.words import (
+    AGENT_LEVELS,
     AGENT_WORDS,
     GOOD,
     LEVELS,
@@ -235,7 +236,7 @@ def _agents(forecast: ForecastSet, ghosts: Ghosts) -> Agents:
         object_id=forecast.object_id.tolist(),
         kind=[class_words(number) for number in forecast.object_class.tolist()],
         words=[AGENT_WORDS.get(mode, mode.name) for mode in modes],
-        level=[LEVELS.get(mode, GOOD) for mode in modes],
+        level=[AGENT_LEVELS.get(mode, GOOD) for mode in modes],
         age_s=_rounded(forecast.age_s, 3),
         range_m=_rounded(np.linalg.norm(forecast.position - ego[:2], axis=-1), 1),
         speed_mps=_rounded(np.linalg.norm(forecast.velocity, axis=-1), 2),

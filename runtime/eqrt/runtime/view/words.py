@@ -19,21 +19,28 @@ LEVELS = {
     Mode.SILENT: BAD,
 }
 """How much of the service there is."""
+AGENT_LEVELS = {Mode.RUN: GOOD, Mode.PARTIAL: LIMITED, Mode.LATE: BAD, Mode.FALLBACK: BAD}
 
 MODE_WORDS = {
     Mode.RUN: "Full service: model, map and ego motion",
     Mode.NO_MAP: "No map here: predicting without lanes",
     Mode.NO_POSE: "No map pose: predicting without lanes",
-    Mode.LATE: "Late: predicting took longer than one period",
+    Mode.LATE: "Late: predictions come late, or not all from the model",
     Mode.FALLBACK: "Without the model: constant turn rate and speed",
     Mode.SILENT: "No input from the sensor: earlier predictions are void",
 }
 AGENT_WORDS = {
     Mode.RUN: "by the model, from a full history",
     Mode.PARTIAL: "by the model, from a short history",
-    Mode.FALLBACK: "at constant turn rate and speed, without the model",
+    Mode.LATE: "at constant turn rate and speed: no time for the model",
+    Mode.FALLBACK: "at constant turn rate and speed: the model failed",
 }
-AGENT_BRIEF = {Mode.RUN: "full history", Mode.PARTIAL: "short history", Mode.FALLBACK: "no model"}
+AGENT_BRIEF = {
+    Mode.RUN: "full history",
+    Mode.PARTIAL: "short history",
+    Mode.LATE: "no time",
+    Mode.FALLBACK: "no model",
+}
 
 CLASS_WORDS = {kind: kind.name.lower() for kind in ObjectClass} | {ObjectClass.UNKNOWN: "object"}
 
@@ -48,6 +55,9 @@ DROPS = {
     "tracks_refused": "measurements that are not possible",
     "tracks_dropped": "tracks dropped: too many",
     "tracks_resets": "times that all tracks were forgotten",
+    "pipeline_shed": "predictions without the model: no time",
+    "pipeline_fallbacks": "predictions without the model: it failed",
+    "pipeline_model_restarts": "times that the model was loaded anew",
 }
 """Counter of the service (docs/output.md) -> what it counts. All are 0 when all is well."""
 

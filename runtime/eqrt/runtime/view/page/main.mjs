@@ -19,6 +19,7 @@ const page = {
   timeline: new LiveTimeline(),
   hello: null,
   connected: false,
+  lost: false, // and not merely not yet connected
   opened: seconds(),
   statuses: [],
   trouble: "",
@@ -34,10 +35,16 @@ const page = {
 const stream = openStream({
   state: (connected) => {
     page.connected = connected;
+    page.lost = !connected;
     page.opened = seconds();
+    panels();
   },
   text: hear,
-  update: (buffer) => page.timeline.add(decodeUpdate(buffer), seconds()),
+  update: (buffer) => {
+    const first = page.timeline.empty;
+    page.timeline.add(decodeUpdate(buffer), seconds());
+    if (first) panels();
+  },
 });
 
 function hear(message) {
@@ -139,7 +146,7 @@ function panels() {
   const now = seconds();
   const silent = timeline.mode === "live" && timeline.live && !timeline.empty ? now - timeline.arrived : 0;
   page.words = showBanner({
-    connected: page.connected, hello: page.hello, moment, silent,
+    lost: page.lost, hello: page.hello, moment, silent,
     status: page.statuses.at(-1), waiting: now - page.opened,
   });
   showService(page.statuses, moment, timeline.mode, page.trouble ? [page.trouble] : [], scene.colours);
@@ -157,7 +164,7 @@ function showTransport(timeline) {
   if (timeline.empty) return set("when", "");
   const span = timeline.last - timeline.first;
   if (document.activeElement !== by("scrub") || timeline.playing) {
-    by("scrub").value = span ? (1000 * (timeline.time - timeline.first)) / span : 1000;
+    by("scrub").value = span && !timeline.live ? (1000 * (timeline.time - timeline.first)) / span : 1000;
   }
   return set("when", when(timeline));
 }

@@ -9,9 +9,9 @@ const number = (value, digits, unit) =>
   value === null || value === undefined ? "not known" : `${value.toFixed(digits)} ${unit}`;
 
 /** The line at the top: how the service is, in one sentence. Returns it. */
-export function showBanner({ connected, hello, moment, status, silent, waiting }) {
+export function showBanner({ lost, hello, moment, status, silent, waiting }) {
   let [level, words] = ["waiting", "Connecting"];
-  if (!connected) {
+  if (lost) {
     [level, words] = ["lost", "Connection to eqrt view lost"];
   } else if (moment) {
     const { cycle } = moment;
@@ -26,7 +26,7 @@ export function showBanner({ connected, hello, moment, status, silent, waiting }
   set("mark", MARKS[level]);
   set("mode", words);
   set("what", whatRuns(hello, status, moment));
-  showNotice({ connected, hello, moment, waiting });
+  showNotice({ lost, hello, moment, waiting });
   return words;
 }
 
@@ -42,11 +42,11 @@ function whatRuns(hello, status, moment) {
 }
 
 /** What to do, when there is nothing to see. */
-function showNotice({ connected, hello, moment, waiting }) {
+function showNotice({ lost, hello, moment, waiting }) {
   const notice = by("notice");
   const lines = [];
-  if (!connected) {
-    lines.push("Connection lost", "This page talks to `eqrt view`, which has ended or cannot be reached. Start it again, or the ssh tunnel; the page goes on by itself.", "eqrt view");
+  if (lost) {
+    lines.push("Connection lost", "The program that feeds this page has ended or cannot be reached. Start it, or the ssh tunnel, again; the page then goes on by itself.", "eqrt view");
   } else if (!moment && hello?.mode === "live" && waiting > 1) {
     lines.push("Waiting for predictions", `Nothing comes to ${hello.address} yet. Start the service so that it sends there, or add this to how it is started:`, `eqrt serve --can can0 --profile ars408 --datagrams ${hello.address}`);
   }
@@ -71,7 +71,7 @@ export function showService(statuses, moment, mode, troubles, colours) {
   drawHistogram(by("histogram"), values, colours);
   set("service-words", serviceWords(status, values, mode));
   showNumbers("service-numbers", status ? serviceNumbers(status, values) : []);
-  showTroubles([...troubles, ...serviceTroubles(status)]);
+  showTroubles([...troubles, ...serviceTroubles(status)], sinceStart(status));
 }
 
 function serviceWords(status, values, mode) {
@@ -102,15 +102,21 @@ function serviceTroubles(status) {
   const buses = status.buses.filter((bus) => bus.state !== "UP")
     .map((bus) => `CAN ${bus.name}: ${bus.state.toLowerCase().replace("_", " ")} for ${ago(bus.since_s)}`);
   const sources = status.sources.map((s) => `${s.name}: ${s.reason}, for ${ago(s.since_s)}`);
-  const drops = Object.entries(status.drops).map(([words, count]) => `${count} ${words}`);
-  return [...buses, ...sources, ...drops];
+  return [...buses, ...sources];
 }
 
-function showTroubles(troubles) {
+function sinceStart(status) {
+  return Object.entries(status?.drops ?? {}).map(([words, count]) => `since the start, ${count} ${words}`);
+}
+
+/** What is wrong now, then what once was. */
+function showTroubles(troubles, before) {
   const list = by("troubles");
-  if (list.dataset.shown === troubles.join()) return;
-  list.dataset.shown = troubles.join();
-  list.replaceChildren(...troubles.map((words) => element("li", words)));
+  const shown = [...troubles, ...before].join();
+  if (list.dataset.shown === shown) return;
+  list.dataset.shown = shown;
+  list.replaceChildren(...[...troubles, ...before].map((words) => element("li", words)));
+  [...list.children].slice(troubles.length).forEach((item) => item.classList.add("before"));
 }
 
 /** Mean errors of the last minute beside constant velocity's. */

@@ -116,6 +116,9 @@ export class Scene {
     agent.halfY = sin * agent.long + cos * agent.wide;
   }
 
+  /** How far the ring around a selected agent is from its middle. */
+  #ring(agent) { return Math.max(agent.long, 9) + 5; }
+
   #drawLanes(camera) {
     const { context, colours, lanes } = this;
     const [x0, y0, x1, y1] = camera.box;
@@ -284,7 +287,8 @@ export class Scene {
       if (level === "bad") this.#cross(agent);
       if (chosen) {
         context.beginPath();
-        context.arc(agent.px, agent.py, Math.max(agent.long, 9) + 5, 0, 2 * Math.PI);
+        context.arc(agent.px, agent.py, this.#ring(agent), 0, 2 * Math.PI);
+        agent.halfX = agent.halfY = this.#ring(agent) + 1; // its label keeps off
         context.lineWidth = 1.5;
         context.stroke();
       }

@@ -4,6 +4,7 @@ const SIGNS = [
   ["ego vehicle", (c, k) => car(c, k.ego, true)],
   ["agent, as large as measured", (c, k) => car(c, k.agent, true)],
   ["seen for less than 2 s", (c, k) => car(c, k.agent, false)],
+  ["predicted without the model", (c, k) => { car(c, k.agent, false); cross(c, k.bad); }],
   ["size not measured", (c, k) => car(c, k.agent, true, [4, 3])],
   ["neither size nor class measured", (c, k) => dot(c, k.agent)],
   ["where it was, 2 s", (c, k) => line(c, k.past, 1.5)],
@@ -84,4 +85,15 @@ function dot(c, colour) {
   c.beginPath();
   c.arc(22, 9, 5, 0, 2 * Math.PI);
   c.fill();
+}
+
+function cross(c, colour) {
+  c.strokeStyle = colour;
+  c.lineWidth = 2;
+  c.beginPath();
+  c.moveTo(17, 5);
+  c.lineTo(25, 13);
+  c.moveTo(25, 5);
+  c.lineTo(17, 13);
+  c.stroke();
 }
