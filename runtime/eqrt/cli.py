@@ -121,11 +121,12 @@ def command_module(name: str) -> ModuleType:
     try:
         return importlib.import_module(COMMANDS[name][0])
     except ModuleNotFoundError as error:
-        extra = EXTRA_OF.get((error.name or "").partition(".")[0])
+        package = (error.name or "").partition(".")[0]
+        extra = EXTRA_OF.get(package)
         if extra is None:
             raise
         extra = _EXTRA_OF_COMMAND.get(name, extra)
-        raise missing_extra(f"eqrt {name}", error.name or "", extra) from error
+        raise missing_extra(f"eqrt {name}", package, extra) from error
 
 
 def command_parser(name: str, module: ModuleType) -> Parser:

@@ -50,7 +50,10 @@ def test_python_dash_m_is_the_same_command() -> None:
     assert done.stderr.startswith("eqrt: there is no command 'sevre'")
 
 
-@pytest.mark.parametrize(("command", "module", "extra"), [("train", "torch", "train")])
+@pytest.mark.parametrize(
+    ("command", "module", "extra"),
+    [("train", "torch", "train"), ("view", "websockets", "view"), ("top", "rich", "view")],
+)
 def test_a_command_whose_extra_is_missing_says_how_to_install_it(
     command: str,
     module: str,
@@ -59,7 +62,9 @@ def test_a_command_whose_extra_is_missing_says_how_to_install_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     target = cli.COMMANDS[command][0]
-    monkeypatch.delitem(sys.modules, target, raising=False)
+    package = target.rpartition(".")[0]
+    for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)  # what makes `import torch` fail everywhere
     assert cli.main([command]) == 2
     captured = capsys.readouterr()

@@ -53,6 +53,26 @@ def test_a_ghost_between_two_steps_is_on_the_way_between_them() -> None:
     assert (~np.isnan(errors)).sum() > AGENTS / 2
 
 
+def test_a_prediction_of_3_s_is_judged_although_cycles_do_not_come_exactly_so_far_apart() -> None:
+    hindsight = Hindsight()
+    then, now = crowd(0, AGENTS), crowd(30, AGENTS)
+    hindsight.add(then)
+
+    def late(seconds: float) -> ForecastSet:
+        return replace(
+            now,
+            timestamp_s=now.timestamp_s + seconds,
+            anchor_s=now.anchor_s + seconds,
+            position=now.position + seconds * now.velocity,
+            track_id=then.track_id,
+        )
+
+    stayed = now.track_id == then.track_id
+    errors = hindsight.add(late(0.03)).error_m[:, 2]
+    assert stayed.sum() > AGENTS / 3
+    assert errors[stayed] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_track_that_was_not_measured_since_has_no_ghost() -> None:
     """A coasting track repeats its measurement: that says nothing about a prediction."""
     hindsight = Hindsight()

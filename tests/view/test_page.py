@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -50,8 +51,6 @@ def ngsim() -> Iterator[tuple[Viewing, Heard, Serving]]:
 @contextlib.contextmanager
 def sending(viewing: Viewing, change: Callable[[ForecastSet], ForecastSet]) -> Iterator[None]:
     """The crowd's cycles, changed, in a thread."""
-    import threading
-
     ended = threading.Event()
 
     def send() -> None:
@@ -86,6 +85,14 @@ def wait(browser: Browser, condition: str) -> None:
 
 def text(browser: Browser, selector: str) -> str:
     return str(browser.evaluate(f"return document.querySelector('{selector}').innerText"))
+
+
+def scrub_to(browser: Browser, thousandths: int) -> None:
+    """Move the handle of the timeline."""
+    browser.evaluate(
+        f"const handle = document.getElementById('scrub'); handle.value = {thousandths};"
+        "handle.dispatchEvent(new Event('input'))"
+    )
 
 
 def test_traffic_with_a_map_is_shown_and_moves(
@@ -147,9 +154,7 @@ def test_pause_holds_the_picture_and_steps_go_through_the_last_minute(
     assert "s ago" in text(browser, "#when")
     assert text(browser, "#play") == "Play"
     browser.screenshot(artifact("view-paused.png"))
-    browser.evaluate(
-        "const s = document.getElementById('scrub'); s.value = 0; s.dispatchEvent(new Event('input'))"
-    )
+    scrub_to(browser, 0)
     wait(browser, f"e.moment.cycle < {cycle - 15}")
     browser.press("l")
     wait(browser, f"e.live && !e.paused && e.moment.cycle > {cycle}")
@@ -292,10 +297,7 @@ def test_a_file_plays_pauses_and_can_be_gone_through(browser: Browser, tmp_path:
         assert not shown(browser, "paused")
         browser.press("p")
         wait(browser, "e.paused")
-        browser.evaluate(
-            "const s = document.getElementById('scrub'); s.value = 800;"
-            "s.dispatchEvent(new Event('input'))"
-        )
+        scrub_to(browser, 800)
         wait(browser, "Math.abs(e.moment.time_s - 23.9) < 0.2 && e.agents.length === 8")
         wait(browser, "e.ghosts > 3 && e.score !== null")
         cycle = shown(browser, "moment")["cycle"]
@@ -314,7 +316,8 @@ def test_dark_and_narrow(browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
     browser.open(ngsim[0].address)
     wait(browser, "e.agents.length > 5")
     browser.screenshot(artifact("view-dark-narrow.png"))
-    assert browser.evaluate("return document.documentElement.scrollWidth <= innerWidth")
+    for element in ("document.documentElement", "document.getElementById('panels')"):
+        assert browser.evaluate(f"return {element}.scrollWidth <= {element}.clientWidth")
     shade = browser.evaluate("return getComputedStyle(document.body).backgroundColor")
     assert shade == "rgb(20, 24, 27)"
     browser.emulate(prefers_color_scheme="light")

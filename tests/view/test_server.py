@@ -130,9 +130,9 @@ def test_who_asks_for_what_we_do_not_know_is_let_go(asked: str | bytes) -> None:
     async def test(server: ViewServer) -> None:
         async with connect(stream_of(server)) as page:
             await page.send(asked)
-            with pytest.raises(ConnectionClosed):
-                while True:
-                    await page.recv()
+            with contextlib.suppress(ConnectionClosed):
+                async for _ in page:  # the greeting and the past, and then it is closed
+                    pass
         while server.pages:
             await asyncio.sleep(0.01)
 

@@ -105,17 +105,17 @@ def _same_targets(now: ForecastSet, then: ForecastSet) -> tuple[NDArray[np.intp]
 
 
 def _along(then: ForecastSet, rows: NDArray[np.intp], ahead_s: Float64) -> Float64:
-    """(n, 2) on the most probable trajectory, `ahead_s` after the anchor; NaN beyond its end."""
+    """(n, 2) on the most probable trajectory, `ahead_s` after the anchor; NaN beyond its end.
+
+    Cycles do not come exactly 3 s apart: up to `_NEAR_S` after its end, the last step goes on.
+    """
     paths = np.concatenate([then.position[rows, None], then.trajectories[rows, 0]], axis=1)
-    step = ahead_s / then.dt_s
-    before = np.floor(step + 1e-6).astype(int)
-    last = paths.shape[1] - 1
-    beyond = step > last + 1e-3
-    low, high = np.minimum(before, last), np.minimum(before + 1, last)
-    part = (step - before).clip(0.0, 1.0)[:, None]
+    steps = ahead_s / then.dt_s
+    low = np.floor(steps).astype(int).clip(0, paths.shape[1] - 2)
+    part = (steps - low)[:, None]
     index = np.arange(len(rows))
-    place = paths[index, low] * (1.0 - part) + paths[index, high] * part
-    place[beyond] = np.nan
+    place = paths[index, low] * (1.0 - part) + paths[index, low + 1] * part
+    place[steps > paths.shape[1] - 1 + _NEAR_S / then.dt_s + 1e-6] = np.nan
     return np.asarray(place)
 
 

@@ -92,7 +92,7 @@ function serviceNumbers(status, values) {
   }
   rows.push(["predictions", `${(status.latencies_s.length / status.seconds).toFixed(1)} cycles/s`]);
   rows.push(["messages in", `${Math.round(status.messages / status.seconds)} /s`]);
-  rows.push(["cycles missed by this view", `${status.lost_cycles}`]);
+  rows.push(["missed by this view", `${status.lost_cycles} cycles`]);
   rows.push(["runs for", ago(status.uptime_s)]);
   return rows;
 }

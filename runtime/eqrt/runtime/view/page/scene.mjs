@@ -337,6 +337,15 @@ export class Scene {
     context.strokeStyle = colours.ground;
     context.lineWidth = 1;
     context.stroke();
+    const angle = -(pose[2] + camera.turn);
+    const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
+    const at = (ahead, aside) => [px + cos * ahead - sin * aside, py + sin * ahead + cos * aside];
+    context.beginPath(); // an arrow in it, for whom its colour is none
+    context.moveTo(...at(-0.3 * long, -0.6 * wide));
+    context.lineTo(...at(0.4 * long, 0));
+    context.lineTo(...at(-0.3 * long, 0.6 * wide));
+    context.lineWidth = Math.max(1.5, 0.3 * wide);
+    context.stroke();
   }
 
   /** A bar of a round length, and where north is. */

@@ -1,7 +1,7 @@
 // The legend: each sign as it is drawn, and what it means.
 
 const SIGNS = [
-  ["ego vehicle", (c, k) => car(c, k.ego, true)],
+  ["ego vehicle", (c, k) => { car(c, k.ego, true); arrow(c, k.panel); }],
   ["agent, as large as measured", (c, k) => car(c, k.agent, true)],
   ["seen for less than 2 s", (c, k) => car(c, k.agent, false)],
   ["predicted without the model", (c, k) => { car(c, k.agent, false); cross(c, k.bad); }],
@@ -95,5 +95,13 @@ function cross(c, colour) {
   c.lineTo(25, 13);
   c.moveTo(25, 5);
   c.lineTo(17, 13);
+  c.stroke();
+}
+
+function arrow(c, colour) {
+  c.strokeStyle = colour;
+  c.lineWidth = 2;
+  c.beginPath();
+  for (const [x, y] of [[17, 6], [25, 9], [17, 12]]) c.lineTo(x, y);
   c.stroke();
 }
