@@ -248,18 +248,25 @@ def test_what_the_service_sends_reaches_a_page_with_the_minute_before(viewing: V
 
 
 def test_what_is_no_datagram_of_ours_is_said_on_the_page(viewing: Viewing) -> None:
-    async def listen() -> str:
+    async def trouble(page: ClientConnection) -> str:
+        while True:
+            message = await page.recv()
+            if isinstance(message, str) and json.loads(message)["kind"] == "trouble":
+                return str(json.loads(message)["words"])
+
+    async def listen() -> tuple[str, str]:
         host, _, port = viewing.datagrams.rpartition(":")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(b"\x81\xa7version\x63", (host, int(port)))
         async with connect(f"ws://{viewing.host}/stream") as page:
-            while True:
-                message = await page.recv()
-                if isinstance(message, str) and json.loads(message)["kind"] == "trouble":
-                    return str(json.loads(message)["words"])
+            before = await trouble(page)
+            with DatagramPublisher([viewing.datagrams]) as publisher:
+                publisher.publish(crowd(0, 1))
+            return before, await trouble(page)
 
-    words = asyncio.run(asyncio.wait_for(listen(), 60.0))
-    assert words == "datagram format 99, this version of eqrt reads format 2"
+    before, after = asyncio.run(asyncio.wait_for(listen(), 60.0))
+    assert before == "datagram format 99, this version of eqrt reads format 2"
+    assert after == ""  # when what comes can be read again
 
 
 def test_a_file_is_told_cycle_by_cycle(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from eqrt.core.frames import Pose2
 from eqrt.core.metrics import LENGTH_OF_SHARE
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
+from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.view.hindsight import Hindsight
 from eqrt.runtime.view.recorded import read_records
@@ -109,7 +110,7 @@ def test_only_what_went_wrong_is_told() -> None:
 
 def test_lanes_are_told_around_the_ego_vehicle_and_again_when_it_has_driven_on() -> None:
     tile = load_tile(TILE)
-    lanes = Lanes(tile)
+    lanes = Lanes(TILE)
     assert lanes.near(one_car()) is None  # predicted without a map
     x_m, y_m = tile.lane_map.lane_points(0)[0].tolist()
 
@@ -127,6 +128,42 @@ def test_lanes_are_told_around_the_ego_vehicle_and_again_when_it_has_driven_on()
     again = lanes.near(there(300.0))
     assert again is not None
     assert json.loads(again)["number"] == told["number"] + 1
+
+
+def test_the_map_is_the_one_that_the_service_says(tmp_path: Path) -> None:
+    tile = load_tile(TILE)
+    x_m, y_m = tile.lane_map.lane_points(0)[0].tolist()
+    place = Pose2(x_m, y_m, 0.0)
+    there = replace(one_car(), tile_id=tile.info.tile_id, mode=Mode.RUN, map_from_ego=place)
+    lanes = Lanes()
+    assert lanes.near(there) is None
+    assert lanes.hear(status_with(tmp_path / "gone.tile", "0badc0de")).startswith(
+        f"no lanes are shown: {tmp_path / 'gone.tile'}: no such tile file"
+    )
+    assert lanes.hear(status_with(TILE, "0ddba11")).endswith("its lanes may differ")
+    assert lanes.hear(status_with(TILE, tile.info.tile_id)) == ""
+    assert lanes.near(there) is not None
+
+
+def status_with(tile: Path, tile_id: str) -> ServiceStatus:
+    return ServiceStatus(
+        time_s=1.0,
+        uptime_s=1.0,
+        seconds=1.0,
+        eqrt="0",
+        profile="generic",
+        model="m",
+        model_id="",
+        tile=str(tile),
+        tile_id=tile_id,
+        mode=Mode.RUN,
+        mode_s=1.0,
+        objects=0,
+        messages=0,
+        latencies_s=[],
+        stages_s={},
+        totals={},
+    )
 
 
 def test_a_replayed_file_is_what_the_service_said(tmp_path: Path) -> None:

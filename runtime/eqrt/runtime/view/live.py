@@ -10,11 +10,10 @@ from pathlib import Path
 
 import msgspec
 
-from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.errors import UsageError
 from eqrt.runtime.output.datagrams import Datagram, decode_datagram
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.view.joining import Joiner
 from eqrt.runtime.view.server import Outbox, ViewServer, Wanted
 from eqrt.runtime.view.updates import encode_status, encode_text
@@ -93,10 +92,9 @@ class Live:
         self._ear = ear
         self._address = address
         self._watch, self._minute = Watch(), LastMinute()
-        self._lanes = Lanes(load_tile(tile) if tile else None)
-        self._fixed_tile = tile is not None
-        self._tile_name = ""
+        self._lanes = Lanes(tile)
         self._statuses: deque[msgspec.Raw] = deque(maxlen=_STATUSES)
+        self._lanes_trouble = ""
         self._said = ""
 
     def greet(self, outbox: Outbox) -> None:
@@ -121,7 +119,7 @@ class Live:
                 self._take_status(record, server)
             else:
                 self._take_cycle(record, server)
-        self._say(self._ear.trouble, server)
+        self._say(server)
 
     def _take_cycle(self, forecast: ForecastSet, server: ViewServer) -> None:
         if (lanes := self._lanes.near(forecast)) is not None:
@@ -134,15 +132,12 @@ class Live:
         text = encode_status(status, lost_cycles=self._ear.lost_cycles)
         self._statuses.append(msgspec.Raw(text.encode()))
         server.tell("status", text)
-        if status.tile and status.tile != self._tile_name and not self._fixed_tile:
-            self._tile_name = status.tile
-            try:
-                self._lanes.change(load_tile(Path(status.tile)))
-            except EqrtError as error:
-                self._say(f"no lanes are shown: {error}", server)
+        self._lanes_trouble = self._lanes.hear(status) or self._lanes_trouble
 
-    def _say(self, trouble: str, server: ViewServer) -> None:
-        if trouble and trouble != self._said:
+    def _say(self, server: ViewServer) -> None:
+        """What is wrong now, when it has changed."""
+        trouble = "; ".join(filter(None, (self._ear.trouble, self._lanes_trouble)))
+        if trouble != self._said:
             self._said = trouble
             server.tell("trouble", encode_text("trouble", words=trouble))
 

@@ -18,7 +18,6 @@ import msgspec
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.view.server import Outbox, ViewServer, Wanted
 from eqrt.runtime.view.updates import encode_status, encode_text
 from eqrt.runtime.view.watch import Lanes, Watch
@@ -34,7 +33,7 @@ class Playback:
     ) -> None:
         self._records, self._name = records, name
         self._watch = Watch()
-        self._lanes = Lanes(load_tile(tile) if tile else None)
+        self._lanes = Lanes(tile)
         self._store = _Store()
         self._times_s: list[float] = []
         self._lanes_from: list[tuple[int, str]] = []
@@ -103,6 +102,7 @@ class Playback:
 
     def _take(self, record: ForecastSet | ServiceStatus) -> None:
         if isinstance(record, ServiceStatus):
+            self.trouble = self._lanes.hear(record) or self.trouble
             self._statuses.append(msgspec.Raw(encode_status(record, lost_cycles=0).encode()))
             return
         if (lanes := self._lanes.near(record)) is not None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from pathlib import Path
 
+from eqrt.core.errors import EqrtError
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
-from eqrt.runtime.prediction.tiles import Tile
+from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.view.hindsight import Ghosts, Hindsight, Score
 from eqrt.runtime.view.updates import ego_pose, encode_lanes, encode_update, is_on_map
 
@@ -90,17 +93,29 @@ class LastMinute:
 class Lanes:
     """The lanes around the ego vehicle, said again when it has driven on."""
 
-    def __init__(self, tile: Tile | None = None) -> None:
-        self._tile = tile
+    def __init__(self, tile: Path | None = None) -> None:
+        """`tile`: shown whatever the service says; None = its own. Raises TileError."""
+        self._tile = load_tile(tile) if tile else None
+        self._is_fixed = tile is not None
+        self._heard = ""
         self._centre: tuple[float, float] | None = None
         self.number = -1
         """Of the newest message."""
         self.message: str | None = None
         """The newest, for whoever joins."""
 
-    def change(self, tile: Tile) -> None:
-        """Another map."""
-        self._tile, self._centre = tile, None
+    def hear(self, status: ServiceStatus) -> str:
+        """Take the map that the service says it uses; returns what is wrong with it, or ""."""
+        if self._is_fixed or not status.tile or status.tile_id == self._heard:
+            return ""
+        self._heard = status.tile_id
+        try:
+            self._tile, self._centre = load_tile(Path(status.tile)), None
+        except EqrtError as error:
+            return f"no lanes are shown: {error}"
+        if self._tile.info.tile_id != status.tile_id:
+            return f"{status.tile} has changed since the service read it: its lanes may differ"
+        return ""
 
     def near(self, forecast: ForecastSet) -> str | None:
         """What to tell, if it is something new."""
