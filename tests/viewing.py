@@ -32,7 +32,7 @@ class Viewing:
             text=True,
             env=environment(),
         )
-        self.address = ""
+        self.ready = self.address = ""
 
     @property
     def host(self) -> str:
@@ -47,9 +47,9 @@ class Viewing:
 
     def __enter__(self) -> Viewing:
         assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line.startswith("eqrt view: http://"), self.end()
-        self.address = line.split()[2]
+        self.ready = self.process.stdout.readline()
+        assert self.ready.startswith("eqrt view: http://"), self.end()
+        self.address = self.ready.split()[2]
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -343,4 +343,4 @@ def test_over_ssh_it_says_how_to_reach_it(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setitem(os.environ, "SSH_CONNECTION", "1.2.3.4 1 5.6.7.8 22")
     with Viewing() as viewing:
         port = viewing.host.rpartition(":")[2]
-        assert f"ssh -L {port}:127.0.0.1:{port}" in viewing.end()[1]
+        assert f"ssh -L {port}:127.0.0.1:{port}" in viewing.ready

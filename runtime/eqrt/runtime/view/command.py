@@ -111,11 +111,12 @@ async def _serve(server: ViewServer, work: Awaitable[None], *, open_page: bool) 
 
 def _say(server: ViewServer, *, open_page: bool) -> None:
     address = server.address
-    print(f"eqrt view: {address}  Ctrl-C ends", flush=True)
     host, _, port = address.removeprefix("http://").rstrip("/").rpartition(":")
+    hint = ""
+    if is_loopback(host.strip("[]")) and "SSH_CONNECTION" in os.environ:
+        hint = f"; from your own machine: ssh -L {port}:{host}:{port} THIS_MACHINE"
+    print(f"eqrt view: {address}  Ctrl-C ends{hint}", flush=True)
     if not is_loopback(host.strip("[]")):
         print(f"eqrt view: everybody who can reach {host} can watch", file=sys.stderr)
-    elif "SSH_CONNECTION" in os.environ:
-        print(f"eqrt view: from your own machine, first: ssh -L {port}:{host}:{port} THIS_MACHINE")
     if open_page and not webbrowser.open(address):
         print("eqrt view: no browser here; open the address yourself", file=sys.stderr)
