@@ -123,11 +123,16 @@ def test_the_command_tells_its_version_and_help(installed: Installed) -> None:
     assert installed.run("eqrt", "--help").returncode == 0
 
 
-def test_a_command_of_the_workstation_names_its_extra(installed: Installed) -> None:
-    done = installed.run("eqrt", "train")
+@pytest.mark.parametrize(
+    ("command", "extra"), [("train", "train"), ("view", "view"), ("top", "view")]
+)
+def test_a_command_that_needs_an_extra_names_it(
+    installed: Installed, command: str, extra: str
+) -> None:
+    done = installed.run("eqrt", command)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    assert "pip install 'eqrt[train]'" in done.stderr
+    assert f"pip install 'eqrt[{extra}]'" in done.stderr
 
 
 def test_the_installed_command_plays_its_demo(installed: Installed, tmp_path: Path) -> None:

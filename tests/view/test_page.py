@@ -253,13 +253,14 @@ def test_before_anything_comes_it_says_what_to_run_and_goes_on_by_itself(browser
         with sending(viewing, lambda forecast: forecast):
             wait(browser, "e.agents.length === 8")
             wait(browser, "document.getElementById('notice').hidden")
-        wait(browser, "e.words.startsWith('Nothing heard of the service for ')")
+        wait(browser, "e.words.startsWith('Nothing heard of the service, for ')")
     wait(browser, "e.words === 'Connection to eqrt view lost'")
     assert "eqrt view" in text(browser, "#notice")
     browser.screenshot(artifact("view-connection-lost.png"))
     port = int(viewing.host.rpartition(":")[2])
-    with Viewing(port=port):
-        wait(browser, "e.connected")
+    browser.press("p")
+    with Viewing(port=port) as again, sending(again, lambda forecast: forecast.targets(slice(5))):
+        wait(browser, "e.connected && e.live && e.agents.length === 5")  # and it is not paused
 
 
 @pytest.mark.parametrize(

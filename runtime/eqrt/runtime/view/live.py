@@ -15,7 +15,7 @@ from eqrt.runtime.output.datagrams import Datagram, decode_datagram
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.view.joining import Joiner
-from eqrt.runtime.view.server import Outbox, ViewServer, Wanted
+from eqrt.runtime.view.server import SERVER_ID, Outbox, ViewServer, Wanted
 from eqrt.runtime.view.updates import encode_status, encode_text
 from eqrt.runtime.view.watch import Lanes, LastMinute, Watch
 
@@ -99,7 +99,9 @@ class Live:
 
     def greet(self, outbox: Outbox) -> None:
         """The last minute, and what is known by now."""
-        outbox.tell("hello", encode_text("hello", mode="live", address=self._address))
+        outbox.tell(
+            "hello", encode_text("hello", mode="live", server=SERVER_ID, address=self._address)
+        )
         if self._lanes.message:
             outbox.tell("lanes", self._lanes.message)
         outbox.tell("statuses", encode_text("statuses", statuses=list(self._statuses)))

@@ -18,7 +18,7 @@ import msgspec
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.view.server import Outbox, ViewServer, Wanted
+from eqrt.runtime.view.server import SERVER_ID, Outbox, ViewServer, Wanted
 from eqrt.runtime.view.updates import encode_status, encode_text
 from eqrt.runtime.view.watch import Lanes, Watch
 
@@ -54,7 +54,7 @@ class Playback:
 
     def greet(self, outbox: Outbox) -> None:
         """What the file is, and how far it has been read."""
-        outbox.tell("hello", encode_text("hello", mode="file", name=self._name))
+        outbox.tell("hello", encode_text("hello", mode="file", server=SERVER_ID, name=self._name))
         outbox.tell("index", self._index())
         if self.done:
             outbox.tell("statuses", encode_text("statuses", statuses=self._statuses))

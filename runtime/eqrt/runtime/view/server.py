@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import secrets
 from collections import deque
 from collections.abc import Iterator
 from http import HTTPStatus
@@ -25,6 +26,8 @@ from eqrt.runtime.view.guests import PAGE_HEADERS, is_our_name, is_our_page
 
 PAGE = Path(__file__).parent / "page"
 SOCKET_PATH = "/stream"
+SERVER_ID = secrets.token_hex(8)
+"""By which a page that comes back tells whether this is the server that it knew."""
 QUEUE = 4
 MAX_PAGES = 16
 _PING_S = 10.0

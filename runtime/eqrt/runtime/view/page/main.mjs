@@ -75,12 +75,17 @@ function hear(message) {
   }
 }
 
+/** A server: the one that was lost, and then nothing is forgotten, or another. */
 function greet(message) {
-  page.hello = message;
-  if (message.mode === "file" && page.timeline.mode !== "file") {
-    page.timeline = new FileTimeline((wanted) => stream.ask(wanted));
-    by("speed").hidden = false;
+  if (page.hello?.server !== message.server) {
+    const ofFile = message.mode === "file";
+    page.timeline = ofFile ? new FileTimeline((wanted) => stream.ask(wanted)) : new LiveTimeline();
+    page.statuses = [];
+    page.trouble = "";
+    scene.lanes = null;
+    by("speed").hidden = !ofFile;
   }
+  page.hello = message;
   set("live", message.mode === "file" ? "To end" : "Live");
 }
 

@@ -10,24 +10,27 @@ const number = (value, digits, unit) =>
 
 /** The line at the top: how the service is, in one sentence. Returns it. */
 export function showBanner({ lost, hello, moment, status, silent, waiting }) {
-  let [level, words] = ["waiting", "Connecting"];
+  let [level, words, since] = ["waiting", "Connecting", ""];
   if (lost) {
     [level, words] = ["lost", "Connection to eqrt view lost"];
   } else if (moment) {
     const { cycle } = moment;
-    const since = moment.time - cycle.mode_since_s;
-    const lasts = cycle.level === "good" || since < 1 ? "" : `, for ${ago(since)}`;
-    [level, words] = [cycle.level, `${cycle.mode_words}${lasts}`];
-    if (silent > STALE_S) [level, words] = ["lost", `Nothing heard of the service for ${ago(silent)}`];
+    const lasts = moment.time - cycle.mode_since_s;
+    [level, words] = [cycle.level, cycle.mode_words];
+    if (cycle.level !== "good" && lasts >= 1) since = `, for ${ago(lasts)}`;
+    if (silent > STALE_S) {
+      [level, words, since] = ["lost", "Nothing heard of the service", `, for ${ago(silent)}`];
+    }
   } else if (hello) {
     words = hello.mode === "file" ? `Reading ${hello.name}` : "Waiting for predictions";
   }
   by("banner").className = level;
   set("mark", MARKS[level]);
   set("mode", words);
+  set("since", since); // apart, so that a screen reader is not told every second
   set("what", whatRuns(hello, status, moment));
   showNotice({ lost, hello, moment, waiting });
-  return words;
+  return words + since;
 }
 
 function whatRuns(hello, status, moment) {

@@ -29,6 +29,7 @@ export class LiveTimeline {
     if (newest && cycle.stream > newest.stream) {
       this.cycles = [];
       this.lags = [];
+      this.time = undefined;
     }
     const at = this.#after(cycle.time_s);
     if (this.cycles[at - 1]?.cycle === cycle.cycle) return;
