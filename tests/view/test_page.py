@@ -49,13 +49,18 @@ def ngsim() -> Iterator[tuple[Viewing, Heard, Serving]]:
 
 
 @contextlib.contextmanager
-def sending(viewing: Viewing, change: Callable[[ForecastSet], ForecastSet]) -> Iterator[None]:
+def sending(
+    viewing: Viewing,
+    change: Callable[[ForecastSet], ForecastSet] = lambda forecast: forecast,
+    *,
+    agents: int = 8,
+) -> Iterator[None]:
     """The crowd's cycles, changed, in a thread."""
     ended = threading.Event()
 
     def send() -> None:
         with DatagramPublisher([viewing.datagrams]) as publisher:
-            for forecast in cycles(8):
+            for forecast in cycles(agents):
                 if ended.is_set():
                     return
                 publisher.publish(change(forecast))
@@ -187,12 +192,31 @@ def test_a_click_selects_an_agent_and_shows_its_numbers(
     assert browser.console() == []
 
 
-def test_no_label_lies_on_another(browser: Browser, ngsim: tuple[Viewing, Heard, Serving]) -> None:
-    browser.open(ngsim[0].address)
-    wait(browser, "e.labels.length > 8")
-    boxes = shown(browser, "labels")
+def test_no_label_lies_on_another(browser: Browser) -> None:
+    with Viewing() as viewing, sending(viewing, agents=64):
+        browser.open(viewing.address)
+        wait(browser, "e.agents.length === 64 && e.labels.length > 15")
+        boxes = shown(browser, "labels")
+        browser.screenshot(artifact("view-64-agents.png"))
     for a, b in itertools.combinations(boxes, 2):
         assert not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3])
+
+
+def test_between_two_cycles_agents_are_on_their_way_and_never_beyond(browser: Browser) -> None:
+    """An agent of the crowd drives straight on at a constant speed."""
+    with Viewing() as viewing, sending(viewing):
+        browser.open(viewing.address)
+        wait(browser, "e.live && e.kept > 10")
+        browser.evaluate(
+            "window.seen = []; const id = window.eqrt.agents[0].id; const look = () => {"
+            "const a = window.eqrt.agents.find((one) => one.id === id); if (a) seen.push(a.x);"
+            "if (seen.length < 90) requestAnimationFrame(look); }; look()"
+        )
+        wait(browser, "seen.length === 90")
+        seen = browser.evaluate("return window.seen")
+    steps = [abs(after - before) for before, after in itertools.pairwise(seen)]
+    assert sum(step > 0.0 for step in steps) > 45  # ten cycles a second alone would give 15
+    assert max(steps) < 5.0
 
 
 def test_wheel_drag_and_keys_move_the_view(
@@ -250,7 +274,7 @@ def test_before_anything_comes_it_says_what_to_run_and_goes_on_by_itself(browser
         wait(browser, "!document.getElementById('notice').hidden")
         assert f"--datagrams {viewing.datagrams}" in text(browser, "#notice")
         browser.screenshot(artifact("view-waiting.png"))
-        with sending(viewing, lambda forecast: forecast):
+        with sending(viewing):
             wait(browser, "e.agents.length === 8")
             wait(browser, "document.getElementById('notice').hidden")
         wait(browser, "e.words.startsWith('Nothing heard of the service, for ')")
