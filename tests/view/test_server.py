@@ -105,12 +105,45 @@ def test_a_page_that_does_not_read_costs_a_few_updates_of_memory_and_the_others_
             assert got == 500
             assert spent_s < 1.0  # nobody waits for the slow one
             assert server.skipped > 300  # the rest lies in buffers of the kernel
-            assert max(len(outbox._updates) for outbox in server._outboxes) <= QUEUE
+            assert max(len(outbox._updates) for outbox in server._outboxes.values()) <= QUEUE
             slow.transport.resume_reading()
             while (await slow.recv())[:4] != (499).to_bytes(4, "little"):
                 pass  # what was under way, then the newest
 
     with_server(test)
+
+
+async def read_nothing(server: ViewServer) -> ClientConnection:
+    """A page that has stopped, with all buffers on the way to it full."""
+    page = await connect(stream_of(server), max_queue=1)
+    page.transport.pause_reading()
+    for _ in range(300):
+        server.show(UPDATE)
+        await asyncio.sleep(0)
+    return page
+
+
+def test_a_page_that_reads_nothing_for_long_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("eqrt.runtime.view.server.STUCK_S", 0.5)
+
+    async def test(server: ViewServer) -> None:
+        page = await read_nothing(server)
+        while server.pages:
+            server.show(UPDATE)
+            await asyncio.sleep(0.01)
+        page.transport.abort()
+
+    with_server(test)
+
+
+def test_a_page_that_reads_nothing_does_not_keep_the_server_from_ending() -> None:
+    async def run() -> None:
+        async with ViewServer(Fixed(), host=HOST, port=0) as server:
+            page = await read_nothing(server)
+        assert server.pages == 0
+        page.transport.abort()
+
+    asyncio.run(asyncio.wait_for(run(), 15.0))
 
 
 def test_a_page_that_has_gone_is_forgotten() -> None:

@@ -30,7 +30,10 @@ SERVER_ID = secrets.token_hex(8)
 """By which a page that comes back tells whether this is the server that it knew."""
 QUEUE = 4
 MAX_PAGES = 16
+STUCK_S = 20.0
+"""How long a page may read nothing; then its connection is cut."""
 _PING_S = 10.0
+_FAREWELL_S = 1.5
 _MAX_ASKED_BYTES = 1_000
 _WRITE_BYTES = 1 << 16  # beyond what the kernel buffers, an update more or less
 AT_ONCE = 100
@@ -109,7 +112,7 @@ class ViewServer:
         """`port`: 0 = any that is free."""
         self._source = source
         self._host, self._port = host, port
-        self._outboxes: set[Outbox] = set()
+        self._outboxes: dict[ServerConnection, Outbox] = {}
         self._server: Server | None = None
 
     @property
@@ -128,16 +131,16 @@ class ViewServer:
     @property
     def skipped(self) -> int:
         """Updates that open pages were too slow for."""
-        return sum(outbox.skipped for outbox in self._outboxes)
+        return sum(outbox.skipped for outbox in self._outboxes.values())
 
     def tell(self, kind: str, text: str) -> None:
         """A text for every page."""
-        for outbox in self._outboxes:
+        for outbox in self._outboxes.values():
             outbox.tell(kind, text)
 
     def show(self, update: bytes) -> None:
         """A new cycle for every page."""
-        for outbox in self._outboxes:
+        for outbox in self._outboxes.values():
             outbox.show(update)
 
     async def __aenter__(self) -> ViewServer:
@@ -166,8 +169,15 @@ class ViewServer:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        if self._server is not None:
-            self._server.close()
+        if self._server is None:
+            return
+        self._server.close()
+        try:
+            async with asyncio.timeout(_FAREWELL_S):
+                await self._server.wait_closed()
+        except TimeoutError:  # a page that does not read takes no farewell either
+            for connection in list(self._outboxes):
+                connection.transport.abort()
             await self._server.wait_closed()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -188,7 +198,7 @@ class ViewServer:
     async def _attend(self, connection: ServerConnection) -> None:
         """One page, until it goes."""
         outbox = Outbox()
-        self._outboxes.add(outbox)
+        self._outboxes[connection] = outbox
         self._source.greet(outbox)
         sending = asyncio.create_task(_send(connection, outbox))
         try:
@@ -199,14 +209,19 @@ class ViewServer:
         except (ConnectionClosed, msgspec.MsgspecError):
             pass  # a page that asks for what we do not know is none of ours
         finally:
-            self._outboxes.discard(outbox)
+            self._outboxes.pop(connection, None)
             sending.cancel()
 
 
 async def _send(connection: ServerConnection, outbox: Outbox) -> None:
+    """Until it goes, or does not take a message for `STUCK_S`."""
     try:
         while True:
-            await connection.send(await outbox.next())
+            message = await outbox.next()
+            async with asyncio.timeout(STUCK_S):
+                await connection.send(message)
+    except TimeoutError:
+        connection.transport.abort()
     except ConnectionClosed:
         pass
 
