@@ -65,7 +65,8 @@ def test_a_command_whose_extra_is_missing_says_how_to_install_it(
     package = target.rpartition(".")[0]
     for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, module, None)  # what makes `import torch` fail everywhere
+    for name in [module, *(name for name in sys.modules if name.startswith(f"{module}."))]:
+        monkeypatch.setitem(sys.modules, name, None)  # what makes `import torch` fail everywhere
     assert cli.main([command]) == 2
     captured = capsys.readouterr()
     assert captured.err == (
