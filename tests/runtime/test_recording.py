@@ -8,7 +8,6 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from mcap.exceptions import McapError
 
-from drives import DRIVES, Car, first_seconds, shipped_predictor, traffic
+from drives import DRIVES, Car, shipped_predictor, traffic
 from eqrt.cli import main
 from eqrt.core.errors import LogError, RecordingError
 from eqrt.runtime.bus.buses import LOCAL
@@ -35,48 +34,10 @@ from eqrt.runtime.recording.reader import Recording, read_recordings
 from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.steps import Step, TapedClock
 from eqrt.runtime.service import Service
-from processes import PATIENCE_S, Heard, Serving, eqrt, playing
+from processes import PATIENCE_S, Heard, Serving, eqrt
+from recorded_drives import CHANNELS, patiently, recorded_drive
 
-CHANNELS = (f"record-{number}-{time.monotonic_ns()}" for number in itertools.count())
-SECONDS = 4.0
 PLAY = ("--can", "nowhere", "--can-interface", LOCAL)
-
-
-@contextlib.contextmanager
-def recorded_drive(
-    name: str,
-    folder: Path,
-    log: Path,
-    *options: str,
-    seconds: float = SECONDS,
-    until: int | None = None,
-) -> Iterator[tuple[Serving, Heard]]:
-    """A service that records, and has been played some seconds of a drive, or so much of them
-    that it has sent `until` cycles; then it is still being played.
-    """
-    drive = DRIVES[name]
-    channels = {role: next(CHANNELS) for role in drive.roles}
-    cans = [f"--can={role}={channel}" for role, channel in channels.items()]
-    log.write_text(first_seconds(drive.log, seconds))
-    with Heard(next(CHANNELS)) as heard:
-        more = ["--can-interface", LOCAL, "--out-can=none", "--datagrams", heard.address]
-        service = Serving(*cans, *more, *drive.options, "--record", str(folder), *options)
-        with service:
-            routes = [f"--can={drive.roles[role]}={channel}" for role, channel in channels.items()]
-            with playing(log, *routes) as player:
-                if until is None:
-                    player.wait(PATIENCE_S)
-                else:
-                    patiently(lambda: len(heard.forecasts) >= until)
-                yield service, heard
-
-
-def patiently(condition: Callable[[], bool]) -> None:
-    """Wait until it holds."""
-    give_up_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < give_up_s
-        time.sleep(0.02)
 
 
 def writer_of(service: Serving) -> int:

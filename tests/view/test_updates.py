@@ -25,6 +25,7 @@ from eqrt.runtime.view.updates import STEP_M, course_rad, decode_update, encode_
 from eqrt.runtime.view.watch import Lanes, Watch
 from eqrt.runtime.view.words import DROPS, LEVELS, drops, mode_words
 from forecast_sets import many, nobody, one_car
+from recorded_drives import recorded_drive
 
 
 def update_of(forecast: ForecastSet) -> bytes:
@@ -186,6 +187,21 @@ def test_a_replayed_file_is_what_the_service_said(tmp_path: Path) -> None:
         head, _ = decode_update(watch.update(record))
     assert head["ego"] is None
     assert head["agents"]["error_m"][stayed[0]][0] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_recording_is_what_the_service_said_of_itself_too(tmp_path: Path) -> None:
+    """A real service's, two seconds of it: the folder, and each of its files."""
+    folder = tmp_path / "recorded"
+    with recorded_drive("ngsim", folder, tmp_path / "some.log", seconds=2.5) as (service, heard):
+        service.end()
+    records = list(read_records(folder))
+    cycles = [record for record in records if isinstance(record, ForecastSet)]
+    assert [one.cycle for one in cycles] == [one.cycle for one in heard.forecasts]
+    assert all(one.history_valid.any() for one in cycles if one.num_targets)
+    statuses = [record for record in records if isinstance(record, ServiceStatus)]
+    assert [one.time_s for one in statuses] == [one.time_s for one in heard.statuses]
+    (file,) = folder.glob("*.mcap")
+    assert len(list(read_records(file))) == len(records)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         type=Path,
         metavar="FILE",
-        help=f"watch this instead of a running service: {', '.join(READERS)} (docs/view.md)",
+        help=f"watch this instead of a running service: {', '.join(READERS)}, or a "
+        "folder of `eqrt serve --record` (docs/view.md)",
     )
     add_datagram_argument(parser)
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Files that can be watched: what `eqrt replay` writes."""
+"""Files that can be watched: recordings of the service, and what `eqrt replay` writes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import Line
 from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.recording.folder import SUFFIX
+from eqrt.runtime.recording.reader import read_recordings
+from eqrt.runtime.recording.topics import Topic
 
 Records = Iterator[ForecastSet | ServiceStatus]
 
@@ -26,10 +29,13 @@ _MAX_GAP_S = 0.3  # between two measurements of a track; a longer way is not dra
 
 
 def read_records(path: Path) -> Records:
-    """What is recorded in a file, in its order. Raises LogError, also later, if it is unreadable.
+    """What is recorded in a file, in its order; in a folder, what the service recorded there.
 
-    A format is a suffix and a function that reads it.
+    A format is a suffix and a function that reads it. Raises LogError, also later, if it is
+    unreadable.
     """
+    if path.is_dir():
+        return read_recording(path)
     read = READERS.get(path.suffix)
     if read is None:
         known = " or ".join(READERS)
@@ -42,6 +48,14 @@ def read_records(path: Path) -> Records:
     return read(path)
 
 
+def read_recording(path: Path) -> Records:
+    """Cycles and status from what `eqrt serve --record` wrote: a file, or a folder of them."""
+    for recording in read_recordings(path):
+        for recorded in recording.entries(frozenset({Topic.FORECASTS, Topic.STATUS})):
+            if isinstance(recorded.entry, (ForecastSet, ServiceStatus)):
+                yield recorded.entry
+
+
 def read_json_lines(path: Path) -> Records:
     """Cycles from JSON lines (docs/output.md). They say nothing of the ego vehicle and of sizes;
     a track's history is where the lines before put it.
@@ -52,7 +66,10 @@ def read_json_lines(path: Path) -> Records:
         yield _forecast(cycle, path, past.histories(cycle))
 
 
-READERS: dict[str, Callable[[Path], Records]] = {".jsonl": read_json_lines}
+READERS: dict[str, Callable[[Path], Records]] = {
+    SUFFIX: read_recording,
+    ".jsonl": read_json_lines,
+}
 
 
 def _lines(path: Path) -> Iterator[Line]:
