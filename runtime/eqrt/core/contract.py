@@ -19,6 +19,9 @@ SCHEMA = 1
 METADATA_KEY = "eqrt_contract"
 """The ONNX metadata entry that holds the contract."""
 
+MAX_CHARACTERS = 1 << 16
+"""Of the contract's text; it has about 1,300."""
+
 LANE_CHOICES = ("routes", "nearest")
 """`routes`: the ways through the lane graph that the target may go, then other lanes. `nearest`:
 single lanes, the nearest first, as the papers have it. See the core modules of these names."""
@@ -116,9 +119,11 @@ class ModelContract:
 
         Raises ContractError if it is not JSON, is another schema, or a field is missing or wrong.
         """
+        if len(text) > MAX_CHARACTERS:
+            raise ContractError(f"{where}: {len(text):,} characters are no model contract")
         try:
             values = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:  # also for an endless number, or too deep
             raise ContractError(f"{where}: the model contract is not JSON ({error})") from error
         if not isinstance(values, Mapping):
             raise ContractError(f"{where}: the model contract is not a JSON object")

@@ -6,6 +6,7 @@ The messages that describe one object (or the ego vehicle) are its parts. Bindin
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,8 @@ Values = Sequence[Any]
 """By part, then by row of the part: floats, or arrays with one element per object."""
 
 _NAN = float("nan")
+_MAX_PAYLOAD_BYTES = 64  # of CAN FD
+_MAX_BITS, _FLOAT_BITS = 64, (16, 32, 64)
 _MAX_SPAN_BYTES = 8  # more than any signal in use spans; keeps the decoder to one shift
 _NUMBERED = re.compile(r"\{(slot|object)(?::(0?\d*[dxX]))?\}")
 
@@ -164,6 +167,8 @@ class Binder:
         for signal, layout in zip(found, layouts, strict=True):
             if layout != layouts[0]:
                 raise self.error(key, f"{signal.name!r} is not laid out alike in every slot")
+        if problem := _unreadable(layouts[0]):
+            raise self.error(key, f"the signal {name!r} {problem}")
         if layouts[0].last_byte - layouts[0].first_byte >= _MAX_SPAN_BYTES:
             raise self.error(key, f"the signal {name!r} spans more than {_MAX_SPAN_BYTES} bytes")
         return layouts[0]
@@ -210,6 +215,19 @@ def span(table: SpanTable | None, where: str) -> list[int]:
             f"{where}: first {table.first}, last {table.last} is no span of 1 to 256"
         )
     return list(range(table.first, table.last + 1))
+
+
+def _unreadable(signal: Signal) -> str | None:
+    """Why the decoder cannot read a signal, and those that it is multiplexed by; None if it can."""
+    if not 1 <= signal.length <= _MAX_BITS or signal.first_byte < 0:
+        return f"has {signal.length} bits from byte {signal.first_byte} on"
+    if signal.last_byte >= _MAX_PAYLOAD_BYTES:
+        return f"lies beyond the {_MAX_PAYLOAD_BYTES} bytes of a message"
+    if signal.is_float and signal.length not in _FLOAT_BITS:
+        return f"is a float of {signal.length} bits, not of 16, 32 or 64"
+    if not (math.isfinite(signal.scale) and math.isfinite(signal.offset)):
+        return "has a scale or offset that is not finite"
+    return None if signal.selector is None else _unreadable(signal.selector)
 
 
 def _quoted(names: Mapping[str, float]) -> str:

@@ -140,7 +140,7 @@ class _Parser:
     def _number(self) -> float:
         try:
             number = float(int(self.token, 0)) if "x" in self.token.lower() else float(self.token)
-        except ValueError:
+        except (ValueError, OverflowError):
             number = math.nan
         if not math.isfinite(number):
             raise self.error("a number")

@@ -6,6 +6,7 @@ soon as nothing is missing, else by a timeout or by what begins the next one.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,7 +61,6 @@ class Framing(ABC):
         self._counters = counters
         self._awaits = [True] * len(sensor.parts)
         self._absences = [0] * len(sensor.parts)
-        self._is_open = False
         self._begin(None, None, 0.0)
         self._is_open = False
 
@@ -86,7 +86,7 @@ class Framing(ABC):
         header, count = self._sensor.header, None
         if header is not None and header.count is not None:
             number = header.count.read(data)
-            if not number >= 0.0:  # not there (NaN), or nonsense
+            if not 0.0 <= number < math.inf:  # not there (NaN), or nonsense
                 self._counters.stray += 1
                 return closed
             count = int(number)
@@ -219,7 +219,7 @@ class SlotFraming(Framing):
             self._num_stale += 1
             return closed
         if self._is_open and self._payloads[part][slot] is not None:
-            closed += self._close(complete=False)
+            closed = self._close(complete=False)
         if not self._is_open:
             if self._sensor.header is not None:
                 self._stray(part)

@@ -42,7 +42,7 @@ _MEASURES = {
     "width": "length",
 }
 _MAX_TABLE_BITS = 16
-_MAX_TABLE_BITS = 16
+_MAX_ID_BITS = 53  # what a float64 holds exactly
 
 
 def bind_sensor(table: SensorTable, dbc: Dbc, id_offset: int, where: str) -> SensorProfile:
@@ -121,6 +121,11 @@ class _Sensor:
             return None
         if "." not in name:
             name = f"{next(iter(self.parts))}.{name}"
+        signal = self.binder.signal("fields.id", name)
+        if signal.is_float or signal.length > _MAX_ID_BITS:
+            raise self.binder.error(
+                "fields.id", f"{name} is no integer of up to {_MAX_ID_BITS} bits"
+            )
         return self.binder.reference("fields.id", name, raw=True)
 
     def _join(self, name: str, part: PartTable) -> Reference | None:
@@ -149,7 +154,10 @@ class _Sensor:
         return self._lookup("class", entry.signal, numbers, float(ObjectClass.UNKNOWN))
 
     def _lookup(self, key: str, signal: str, table: dict[int, float], default: float) -> Lookup:
-        bits = self.binder.signal(f"fields.{key}", signal).length
+        found = self.binder.signal(f"fields.{key}", signal)
+        if found.is_float:
+            raise self.binder.error(f"fields.{key}", f"{signal} is a float; a table has integers")
+        bits = found.length
         if bits > _MAX_TABLE_BITS:
             raise self.binder.error(f"fields.{key}", f"{signal} has {bits} bits, too many to list")
         values = np.full((1 << bits) + 1, default)

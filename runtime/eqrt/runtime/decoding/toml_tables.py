@@ -14,9 +14,13 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from eqrt.core.errors import ProfileError
+from eqrt.core.files import read_at_most
 
 T = TypeVar("T")
 
+MAX_BYTES = 1 << 18
+"""Of a file: a hundred times our longest profile."""
+_MAX_INTEGER = (1 << 63) - 1  # of TOML; Python's have no end, and nothing else can hold them
 _SPELLED = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
 
 
@@ -26,10 +30,10 @@ def read_toml(path: Path, kind: type[T]) -> T:
     Raises ProfileError if it cannot be read, is not TOML, or has a wrong key or type.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_at_most(MAX_BYTES, path).decode("utf-8"))
     except OSError as error:
         raise ProfileError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # neither UTF-8 nor TOML
+    except (ValueError, RecursionError) as error:  # neither UTF-8 nor TOML, or far too deep
         raise ProfileError(f"{path} is not TOML: {error}") from error
     return cast("T", _table(values, kind, str(path), ""))
 
@@ -50,6 +54,8 @@ def _value(value: object, kind: Any, path: str, where: str) -> Any:
         return {k: _value(x, item, path, f"{where}.{k}") for k, x in named.items()}
     if origin is Literal and value in get_args(kind) and not isinstance(value, bool):
         return value
+    if isinstance(value, int) and abs(value) > _MAX_INTEGER:
+        raise ProfileError(f"{path}: {where} is an integer of more than 64 bits")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is kind:

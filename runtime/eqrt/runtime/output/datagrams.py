@@ -26,6 +26,7 @@ FORMAT_VERSION = 2
 DEFAULT_ADDRESS = "127.0.0.1:47310"
 MAX_BYTES = 60_000
 """A datagram's size at most; UDP allows 65,507."""
+_MAX_UDP_BYTES = 65_507
 _HEADER_BYTES, _OBJECT_BYTES = 1_200, 66  # more than the map's keys take; per object, less T, K, H
 _SEND_BYTES = 1 << 20
 
@@ -105,6 +106,8 @@ def encode_datagrams(forecasts: ForecastSet) -> Iterator[bytes]:
 
 def decode_datagram(payload: bytes) -> Datagram | ServiceStatus:
     """The record in a datagram; ValueError if it is none of ours or of another version."""
+    if len(payload) > _MAX_UDP_BYTES:
+        raise ValueError(f"{len(payload)} bytes are no datagram")
     try:
         version = msgspec.msgpack.decode(payload, type=_Version).version
         if version != FORMAT_VERSION:
@@ -112,7 +115,7 @@ def decode_datagram(payload: bytes) -> Datagram | ServiceStatus:
                 f"datagram format {version}, this version of eqrt reads format {FORMAT_VERSION}"
             )
         wire = _DECODER.decode(payload)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(f"not a datagram of eqrt ({error})") from error
     if isinstance(wire, _StatusWire):
         return wire.status
@@ -214,7 +217,7 @@ def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
 def _forecasts(wire: _Wire) -> ForecastSet:
     """Raises ValueError if the arrays have not the shape that the map says, or the mode is new."""
     agents, steps, num_modes, horizon = wire.shape
-    if min(wire.shape) < 0:
+    if not all(0 <= size <= _MAX_UDP_BYTES for size in wire.shape):
         raise ValueError(f"not a datagram of eqrt (shape {wire.shape})")
     covariances = None
     if wire.covariances:

@@ -12,6 +12,8 @@ from math import prod
 from pathlib import Path
 
 from eqrt.core.errors import ContractError
+from eqrt.core.files import read_at_most
+from eqrt.runtime.prediction.artifact_limits import MAX_MODEL_BYTES, MAX_TENSOR_AXES
 from eqrt.runtime.prediction.protobuf import fields, varints
 
 KINDS = {1: "float32", 2: "uint8", 3: "int8", 6: "int32", 7: "int64", 9: "bool", 10: "float16"}
@@ -46,7 +48,7 @@ class ModelFile:
 def read_model_file(path: Path) -> ModelFile:
     """Read `model.onnx`. Raises ContractError if it cannot be read or is not an ONNX file."""
     try:
-        return parse_model_file(path.read_bytes())
+        return parse_model_file(read_at_most(MAX_MODEL_BYTES, path))
     except OSError as error:
         raise ContractError(f"{path}: {error.strerror}; a model is a folder with it") from error
     except (ValueError, IndexError, RecursionError) as error:
@@ -143,6 +145,8 @@ def _tensor(tensor: memoryview) -> tuple[str, int, bool]:
                 external = True
             case 14, int():
                 external = external or value == _EXTERNAL
+    if len(dims) > MAX_TENSOR_AXES:
+        raise ValueError(f"a tensor of {len(dims)} axes")
     return name, prod(dims) if kind in _FLOATS else 0, external
 
 

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import METADATA_KEY, ModelContract
 from eqrt.core.errors import ContractError
+from eqrt.core.files import read_at_most
 from eqrt.core.scene import Scene
+from eqrt.runtime.prediction.artifact_limits import MAX_MODEL_BYTES, MAX_TEXT_BYTES
 from eqrt.runtime.prediction.model_file import parse_model_file
 from eqrt.runtime.prediction.stored_vectors import read_vector, vector_folders
 
@@ -160,8 +162,8 @@ def disagreement(name: str, found: NDArray[Any], expected: NDArray[Any]) -> floa
 def _read_checked(folder: Path) -> bytes:
     """The bytes of `model.onnx`, after comparing them with SHA256SUMS."""
     try:
-        content = (folder / "model.onnx").read_bytes()
-        sums = (folder / "SHA256SUMS").read_text(encoding="utf-8", errors="replace")
+        content = read_at_most(MAX_MODEL_BYTES, folder / "model.onnx")
+        sums = read_at_most(MAX_TEXT_BYTES, folder / "SHA256SUMS").decode("utf-8", "replace")
     except OSError as error:
         raise ContractError(
             f"{error.filename}: {error.strerror}; a model is a folder with model.onnx and "

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import ContractError
+from eqrt.core.files import read_at_most
 from eqrt.core.scene import Scene
+from eqrt.runtime.prediction.artifact_limits import MAX_TEXT_BYTES
 from eqrt.runtime.prediction.tensor_proto import read_tensor
 
 TensorSpecs = Mapping[str, tuple[str, tuple[int | str, ...]]]
@@ -72,7 +74,8 @@ def _tensors(folder: Path, side: str, specs: TensorSpecs) -> dict[str, NDArray[A
 
 def _name(folder: Path) -> str:
     try:
-        text = (folder / "name.txt").read_text(encoding="utf-8", errors="replace").strip()
+        content = read_at_most(MAX_TEXT_BYTES, folder / "name.txt")
     except OSError:
         return folder.name
+    text = content.decode("utf-8", "replace").strip()
     return text.splitlines()[0] if text else folder.name

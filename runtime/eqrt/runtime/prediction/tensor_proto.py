@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import ContractError
+from eqrt.core.files import read_at_most
+from eqrt.runtime.prediction.artifact_limits import MAX_TENSOR_AXES, MAX_TENSOR_BYTES
 from eqrt.runtime.prediction.protobuf import fields, varints
 
 _DIMS, _DATA_TYPE, _RAW_DATA = 1, 2, 9
@@ -22,7 +24,7 @@ _DTYPES = {1: np.dtype("<f4"), 9: np.dtype(np.bool_)}  # TensorProto.DataType FL
 def read_tensor(path: Path) -> NDArray[Any]:
     """The array in a `.pb` file. Raises ContractError if it is missing or not such a tensor."""
     try:
-        return parse_tensor(path.read_bytes())
+        return parse_tensor(read_at_most(MAX_TENSOR_BYTES, path))
     except OSError as error:
         raise ContractError(f"{path}: {error.strerror}; export the model again") from error
     except (ValueError, KeyError, IndexError) as error:
@@ -40,6 +42,8 @@ def parse_tensor(content: bytes) -> NDArray[Any]:
             data_type = value
         elif field == _RAW_DATA and isinstance(value, memoryview):
             raw = value
+    if len(dims) > MAX_TENSOR_AXES:
+        raise ValueError(f"a tensor of {len(dims)} axes")
     if any(size > len(raw) for size in dims):
         raise ValueError(f"{len(raw)} bytes for the shape {dims}")
     return np.frombuffer(raw, _DTYPES[data_type]).reshape(dims)

@@ -6,6 +6,8 @@ import hashlib
 import re
 from pathlib import Path, PurePosixPath
 
+from eqrt.core.files import read_at_most
+from eqrt.runtime.prediction.artifact_limits import MAX_MODEL_BYTES, MAX_TEXT_BYTES
 from eqrt.runtime.verify.check import Check, check_of
 
 REQUIRED = ("model.onnx", "contract.json")
@@ -17,7 +19,7 @@ _HOST_PATH = re.compile(rb"(?<![\w.-])/(?:home|root|Users)/[\w.]|\b[A-Za-z]:\\+U
 def check_files(folder: Path) -> Check:
     """Whether the folder holds what SHA256SUMS lists, with these sums, and nothing else."""
     try:
-        text = (folder / "SHA256SUMS").read_bytes().decode("utf-8")
+        text = read_at_most(MAX_TEXT_BYTES, folder / "SHA256SUMS").decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text"
         return check_of(
@@ -43,7 +45,11 @@ def check_host_paths(folder: Path) -> Check:
     """Whether no file tells of the machine that it was made on."""
     failures = []
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        found = _HOST_PATH.search(path.read_bytes())
+        try:
+            found = _HOST_PATH.search(read_at_most(MAX_MODEL_BYTES, path))
+        except OSError as error:
+            failures.append(f"{path}: {error.strerror}")
+            continue
         if found:
             failures.append(f"{path}: holds the path of a machine, {found[0].decode()}...")
     return check_of("host paths", failures, f"{len(failures)} files with one", "0")
@@ -68,7 +74,7 @@ def _compare(folder: Path, name: str, digest: str) -> list[str]:
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         return [f"SHA256SUMS: {name!r} lies outside the folder"]
     try:
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        found = hashlib.sha256(read_at_most(MAX_MODEL_BYTES, path)).hexdigest()
     except (OSError, ValueError) as error:  # ValueError: a name with a null byte
         return [f"{str(path)!r}: {getattr(error, 'strerror', None) or error}, but listed"]
     if found == digest:

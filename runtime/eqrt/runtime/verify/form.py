@@ -9,6 +9,8 @@ from typing import Any
 
 from eqrt.core.contract import METADATA_KEY, UNITS, ModelContract
 from eqrt.core.errors import ContractError
+from eqrt.core.files import read_at_most
+from eqrt.runtime.prediction.artifact_limits import MAX_TEXT_BYTES
 from eqrt.runtime.prediction.model_file import ModelFile
 from eqrt.runtime.prediction.stored_vectors import TensorSpecs
 from eqrt.runtime.verify.check import Check, check_of
@@ -62,10 +64,10 @@ def check_contract(model: ModelFile, contract: ModelContract, folder: Path) -> C
 
 def _beside(inside: Any, path: Path) -> list[str]:
     try:
-        beside = json.loads(path.read_text(encoding="utf-8"))
+        beside = json.loads(read_at_most(MAX_TEXT_BYTES, path).decode("utf-8"))
     except OSError as error:
         return [f"{path}: {error.strerror}"]
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         return [f"{path}: not JSON ({error})"]
     if beside == inside:
         return []

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from eqrt.core.contract import ModelContract
+from eqrt.core.files import read_at_most
+from eqrt.runtime.prediction.artifact_limits import MAX_MODEL_BYTES, MAX_TEXT_BYTES
 from eqrt.runtime.prediction.model_file import ModelFile, read_model_file
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.runtime.prediction.stored_vectors import vector_folders
@@ -21,6 +23,7 @@ Table = list[list[str]]
 
 WIDTH = 100
 """Columns that the text takes at most."""
+_MAX_DIGITS = 20  # of a count of parameters on a model card
 _INDENT = 10  # columns of what a line is about
 
 
@@ -53,7 +56,7 @@ def describe(folder: Path) -> dict[str, Any]:
     model = read_model_file(path)
     contract = read_contract(model, folder)
     card = _card(folder)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(read_at_most(MAX_MODEL_BYTES, path)).hexdigest()
     return {
         "artifact": str(folder),
         "model_id": digest[:8],
@@ -116,7 +119,7 @@ def _wrapped(line: str) -> list[str]:
 def _card(folder: Path) -> list[Table]:
     """The tables of the model card, rows of cells; none without a card."""
     try:
-        text = (folder / "README.md").read_text(encoding="utf-8", errors="replace")
+        text = read_at_most(MAX_TEXT_BYTES, folder / "README.md").decode("utf-8", "replace")
     except OSError:
         return []
     tables: list[Table] = []
@@ -135,13 +138,14 @@ def _parameters(card: list[Table], model: ModelFile) -> int:
     """As the card counts them, else the floating-point numbers in the file."""
     stated = [row[1] for table in card for row in table if row[0] == "parameters" and len(row) > 1]
     digits = stated[0].replace(",", "") if stated else ""
-    return int(digits) if digits.isascii() and digits.isdigit() else model.parameters
+    counted = digits.isascii() and digits.isdigit() and len(digits) < _MAX_DIGITS
+    return int(digits) if counted else model.parameters
 
 
 def _listed(folder: Path) -> str:
     """The model file's sum in SHA256SUMS; empty if there is none."""
     try:
-        text = (folder / "SHA256SUMS").read_text(encoding="utf-8", errors="replace")
+        text = read_at_most(MAX_TEXT_BYTES, folder / "SHA256SUMS").decode("utf-8", "replace")
     except OSError:
         return ""
     return next((line[:64] for line in text.split("\n") if line[66:] == "model.onnx"), "")

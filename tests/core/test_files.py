@@ -1,0 +1,30 @@
+"""A file is read whole, or refused for its size before it is read."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from eqrt.core.files import read_at_most
+
+
+def test_a_file_of_just_the_size_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "four"
+    path.write_bytes(b"four")
+    assert read_at_most(4, path) == b"four"
+
+
+def test_one_byte_more_is_refused_and_the_sizes_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "five"
+    path.write_bytes(b"5 ...")
+    with pytest.raises(OSError, match="5 bytes, and no such file has more than 4") as refusal:
+        read_at_most(4, path)
+    assert refusal.value.errno == errno.EFBIG
+    assert refusal.value.filename == str(path)
+
+
+def test_a_missing_file_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        read_at_most(4, tmp_path / "none")
