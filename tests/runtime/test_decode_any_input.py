@@ -7,7 +7,6 @@ import random
 from dataclasses import asdict
 
 import can
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,45 +14,11 @@ from hypothesis import strategies as st
 from can_recordings import detections_of, feed_all, messages_of
 from eqrt.core.errors import UsageError
 from eqrt.runtime.decoding.can_io import Decoder, Event
-from eqrt.runtime.decoding.detections import Detections, EgoMotion
 from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import builtin_profiles, load_profile
+from soundness import assert_sound
 
 PROFILES = {name: load_profile(name) for name in builtin_profiles()}
-
-
-def assert_sound(decoder: Decoder, events: list[Event]) -> None:
-    """Counters add up, and nothing that came out is half a number."""
-    counters = decoder.counters
-    assert counters.messages == (
-        counters.used + counters.other_id + counters.wrong_bus + counters.not_data
-    )
-    cycles = detections_of(events)
-    assert counters.objects == sum(len(cycle.object_id) for cycle in cycles)
-    for cycle in cycles:
-        assert_consistent(cycle)
-    for event in events:
-        if isinstance(event, EgoMotion):
-            for value in (event.speed_mps, event.yaw_rate_rad_s):
-                assert value is None or math.isfinite(value)
-
-
-def assert_consistent(cycle: Detections) -> None:
-    count = len(cycle.object_id)
-    assert cycle.position.shape == cycle.velocity.shape == (count, 2)
-    assert np.isfinite(cycle.position).all()
-    assert len(np.unique(cycle.object_id)) == count
-    for values in (
-        cycle.is_new,
-        cycle.heading_rad,
-        cycle.length_m,
-        cycle.width_m,
-        cycle.object_class,
-        cycle.existence,
-    ):
-        assert values.shape == (count,)
-    assert cycle.is_new.dtype == np.bool_
-    assert cycle.object_class.dtype == np.uint8
 
 
 @pytest.mark.parametrize("name", PROFILES)
