@@ -82,6 +82,12 @@ def test_an_unknown_origin_comes_back_unknown() -> None:
     _, info = decode(encode(two_lanes(), TileInfo(name="a", source="b", credit="")), "test")
     assert math.isnan(info.origin_latitude_deg)
     assert math.isnan(info.origin_longitude_deg)
+    assert info.origin_deg is None
+    assert replace(info, origin_latitude_deg=49.0).origin_deg is None
+
+
+def test_a_known_origin_is_latitude_and_longitude() -> None:
+    assert INFO.origin_deg == (49.0, 8.4)
 
 
 def test_the_arrays_are_views_of_the_file_and_aligned() -> None:
