@@ -6,10 +6,16 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 # The workstation's environment (torch, linters), and the car's (neither torch nor onnx).
 VENV ?= .venv
 RUNTIME_VENV ?= .venv-runtime
+FUZZ_VENV ?= .venv-fuzz
+MUTATION_VENV ?= .venv-mutation
+FUZZ_SECONDS ?= 60
+FUZZ_JOBS ?= 1
+FUZZ_TARGETS ?=
+MUTATION_MODULES ?=
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table bench figures view-figures faults soak load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures view-figures faults soak load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -41,6 +47,15 @@ conformance: $(RUNTIME_VENV)/.installed ## run the shipped models in other runti
 conformance-table: $(RUNTIME_VENV)/.installed ## the same, and write what was found into docs/conformance.md
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m conformance.run --write
 
+fuzz: $(FUZZ_VENV)/.installed ## fuzz every parser for FUZZ_SECONDS (60); FUZZ_TARGETS="tile dbc" for some
+	@PYTHONPATH=tests $(FUZZ_VENV)/bin/python -m fuzz.run --seconds $(FUZZ_SECONDS) --jobs $(FUZZ_JOBS) $(FUZZ_TARGETS)
+
+mutation: $(MUTATION_VENV)/.installed ## change the code in every small way and see that a test notices; takes long
+	@PYTHONPATH=tests $(MUTATION_VENV)/bin/python -m mutation.run $(MUTATION_MODULES)
+
+coverage: $(VENV)/.installed ## check that tests reach every line and branch of what `make mutation` changes
+	@PYTHONPATH=tests $(VENV)/bin/python -m mutation.cover
+
 bench: $(VENV)/.installed ## measure against the budgets, in 9 minutes; wants a quiet machine
 	$(VENV)/bin/python -m pytest --benchmark-enable --benchmark-only tests/bench
 
@@ -62,7 +77,7 @@ soak: $(RUNTIME_VENV)/.installed ## a simulated day and a real hour of traffic, 
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m soak.run
 
 clean: ## remove the environments and everything else that was made here
-	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance .artifacts
+	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance .artifacts .fuzz .mutation .coverage
 	rm -rf deploy/examples/build deploy/examples/javascript/node_modules
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -83,6 +98,19 @@ $(RUNTIME_VENV)/.installed: pyproject.toml constraints.txt
 
 $(RUNTIME_VENV)/.installed-view: $(RUNTIME_VENV)/.installed
 	@$(RUNTIME_VENV)/bin/python $(PIP_INSTALL) --editable '.[view]'
+	@touch $@
+
+$(FUZZ_VENV)/.installed: pyproject.toml constraints.txt
+	$(call create_environment,$(FUZZ_VENV),what ships to the car and a fuzzer)
+	@$(FUZZ_VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
+	@$(FUZZ_VENV)/bin/python $(PIP_INSTALL) --editable . --group fuzz
+	@touch $@
+
+$(MUTATION_VENV)/.installed: pyproject.toml constraints.txt
+	$(call create_environment,$(MUTATION_VENV),what ships to the car and a maker of mutants)
+	@$(MUTATION_VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
+	@$(MUTATION_VENV)/bin/python $(PIP_INSTALL) --editable . --group mutation
+	@$(MUTATION_VENV)/bin/python -m pip uninstall -qq --yes eqrt # the mutants are to be imported
 	@touch $@
 
 $(RUNTIME_VENV)/.installed-tests: $(RUNTIME_VENV)/.installed
