@@ -24,7 +24,8 @@ from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.serve import add_pipeline_arguments, load_pipeline
+from eqrt.runtime.serve import load_pipeline
+from eqrt.runtime.serve_options import add_pipeline_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

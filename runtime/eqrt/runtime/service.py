@@ -47,6 +47,9 @@ class Publisher(Protocol):
 Observer = Callable[[ServiceStatus], None]
 """Hears once a second how the service is."""
 
+Chore = Callable[[], None]
+"""Is done between two messages, when whatever they completed has been sent: must be quick."""
+
 
 class Service:
     """One pipeline between a receiver and its publishers."""
@@ -57,7 +60,9 @@ class Service:
         receiver: Receiver,
         publishers: Sequence[Publisher],
         observers: Sequence[Observer] = (),
+        *,
         clock: Clock | None = None,
+        chores: Sequence[Chore] = (),
     ) -> None:
         """`clock`: None = when messages arrive."""
         self._pipeline = pipeline
@@ -65,6 +70,7 @@ class Service:
         self._publishers = publishers
         self._observers = observers
         self._clock = clock or ArrivalClock()
+        self._chores = chores
         self._book = StatusBook(pipeline, publishers)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
@@ -80,6 +86,8 @@ class Service:
                 self._publish(self._pipeline.feed(message, now_s), now_s)
             if (monotonic_s := time.monotonic()) >= report_due_s:
                 report_due_s = self._report(monotonic_s, report_due_s)
+            for chore in self._chores:
+                chore()
 
     def _receive(self) -> can.Message | None:
         try:

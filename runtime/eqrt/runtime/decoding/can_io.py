@@ -63,11 +63,18 @@ class Decoder:
         for sensor in self._sensors:
             for address, take in sensor.inputs():
                 self._add_route(address, accepted[sensor.profile.bus], take)
-        origin = None if map_origin_deg is None else MapOrigin(*map(math.radians, map_origin_deg))
-        for ego in profile.ego:
-            decoder = EgoDecoder(ego, origin)
+        origin = _map_origin(map_origin_deg)
+        self._egos = [EgoDecoder(ego, origin) for ego in profile.ego]
+        for ego, decoder in zip(profile.ego, self._egos, strict=True):
             for i, part in enumerate(ego.parts):
                 self._add_route(part.address, accepted[ego.bus], partial(decoder.add, i))
+
+    def set_map_origin(self, map_origin_deg: tuple[float, float] | None) -> bool:
+        """Count latitudes and longitudes from another origin, see `__init__`; True if there are."""
+        geodetic = [ego for ego in self._egos if ego.is_geodetic]
+        for ego in geodetic:
+            ego.set_origin(_map_origin(map_origin_deg))
+        return bool(geodetic)
 
     def _add_route(self, address: Address, channels: _Channels, take: Take) -> None:
         route = _Route(address, channels, take, self.counters)
@@ -102,6 +109,10 @@ class Decoder:
             if told := sensor.expire(now_s):
                 events = [*events, *told]
         return events
+
+
+def _map_origin(origin_deg: tuple[float, float] | None) -> MapOrigin | None:
+    return None if origin_deg is None else MapOrigin(*map(math.radians, origin_deg))
 
 
 class _Route:
