@@ -86,7 +86,8 @@ def _serve(args: argparse.Namespace) -> int:
         reloader = Reloader(
             pipeline, args.model, args.tile, is_asked=is_asked, log=log, tell=manager.reload
         )
-        observers, chores = _surroundings(args, pipeline, publishers, log, stack)
+        endpoint = _endpoint(args, stack)
+        observers, chores = _surroundings(args, pipeline, publishers, log, endpoint)
         service = Service(
             pipeline,
             receiver,
@@ -97,6 +98,8 @@ def _serve(args: argparse.Namespace) -> int:
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
         log.line("ready", f"eqrt serve: {profile.name} on {', '.join(buses)}; Ctrl-C ends")
         log.say(Level.INFO, "running", identity(pipeline.predictor, pipeline.tile))
+        if endpoint is not None:
+            log.say(Level.INFO, "metrics", f"http://{endpoint.address}/metrics and /health answer")
         manager.ready()
         service.run(should_stop)
         manager.stopping()
@@ -116,21 +119,25 @@ def _become_realtime(args: argparse.Namespace, log: EventLog) -> None:
         log.say(Level.WARNING, "realtime", f"realtime {problem}")
 
 
+def _endpoint(args: argparse.Namespace, stack: contextlib.ExitStack) -> Endpoint | None:
+    if not args.metrics:
+        return None
+    return stack.enter_context(Endpoint(args.metrics, anywhere=args.metrics_anywhere))
+
+
 def _surroundings(
     args: argparse.Namespace,
     pipeline: Pipeline,
     publishers: Sequence[Publisher],
     log: EventLog,
-    stack: contextlib.ExitStack,
+    endpoint: Endpoint | None,
 ) -> tuple[list[Observer], list[Chore]]:
     """Who is told every second, and what is done between messages."""
     observers: list[Observer] = [] if args.quiet else [partial(_say, log)]
     observers.append(Changes(log))
     observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
     chores: list[Chore] = [Sweeper(pipeline)] if args.realtime_gc_between_cycles else []
-    if args.metrics:
-        endpoint = stack.enter_context(Endpoint(args.metrics, anywhere=args.metrics_anywhere))
-        log.say(Level.INFO, "metrics", f"answering http://{endpoint.address}/metrics and /health")
+    if endpoint is not None:
         observers.append(endpoint.observe)
         chores.append(endpoint)
     return observers, chores
