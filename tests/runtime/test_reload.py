@@ -81,7 +81,8 @@ def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:
     ends = []
     for first, then in ((TILE, None), (TILE, path), (path, None)):
         pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(first))
-        place = Pose2(*tile.lane_map.points[0].astype(float), 0.0)
+        x_m, y_m = tile.lane_map.points[0].tolist()
+        place = Pose2(x_m, y_m, 0.0)
         said(pipeline, traffic(CARS, 3.0, pose=place))
         if then:
             exchanged(pipeline, shipped_predictor(), load_tile(then))

@@ -110,10 +110,11 @@ class Settings:
         self.options = [*_taken(parser, table)]
         parser.set_defaults(settings=self)
 
-    def resolve(self, given: argparse.Namespace) -> list[Setting]:
+    def resolve(self, given: argparse.Namespace, *, is_complete: bool = True) -> list[Setting]:
         """Every option: from the command line, else from the file, else its default.
 
-        Raises ConfigError if the file cannot be used, UsageError if something required is missing.
+        Raises ConfigError if the file cannot be used, UsageError if something required is missing,
+        unless it need not be complete.
         """
         path: Path | None = given.config
         told = {} if path is None else _File(path).settings(self.options)
@@ -124,7 +125,7 @@ class Settings:
             for option in self.options
         ]
         missing = [s.option.flag for s in found if s.option.required and s.source == DEFAULT]
-        if missing:
+        if missing and is_complete:
             where = f" (or in {path})" if path else ""
             raise UsageError(
                 f"the following arguments are required{where}: {', '.join(missing)}; "
