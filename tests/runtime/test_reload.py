@@ -29,7 +29,11 @@ from handmade_model import CONTRACT, write_handmade
 from processes import PATIENCE_S, Heard, Serving
 
 CARS = [Car(object_id=1, x_m=0.0, y_m=0.0), Car(object_id=2, x_m=20.0, y_m=4.0)]
-POSE = Pose2(10.0, 20.0, 0.5)
+SLOW = [replace(car, speed_mps=0.5) for car in CARS]
+"""They stay where there are lanes for as long as a test takes."""
+X_M, Y_M = load_tile(TILE).lane_map.points[0].tolist()
+POSE = Pose2(X_M, Y_M, 0.0)
+"""Where there are lanes."""
 
 
 def other_tile(folder: Path, **info: object) -> Path:
@@ -81,12 +85,10 @@ def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:
     ends = []
     for first, then in ((TILE, None), (TILE, path), (path, None)):
         pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(first))
-        x_m, y_m = tile.lane_map.points[0].tolist()
-        place = Pose2(x_m, y_m, 0.0)
-        said(pipeline, traffic(CARS, 3.0, pose=place))
+        said(pipeline, traffic(CARS, 3.0, pose=POSE))
         if then:
             exchanged(pipeline, shipped_predictor(), load_tile(then))
-        (after,) = said(pipeline, iter(cycle(CARS, 3.1, pose=place)))
+        (after,) = said(pipeline, iter(cycle(CARS, 3.1, pose=POSE)))
         ends.append(after.trajectories)
     assert not np.allclose(ends[0], ends[1], atol=1e-3)
     np.testing.assert_allclose(ends[1], ends[2], atol=1e-9)
@@ -148,7 +150,7 @@ class Driving:
         due_s = time.monotonic()
         while not done():
             assert time.monotonic() < give_up_s
-            for message in cycle(CARS, self.cycles / 10, pose=POSE):
+            for message in cycle(SLOW, self.cycles / 10, pose=POSE):
                 self._bus.send(message)
             self.cycles += 1
             due_s += 0.1

@@ -141,9 +141,7 @@ class Pipeline:
         """Nothing more will come: close the cycles that are open."""
         return self._handle_all(self.decoder.poll(now_s + _FINISH_S), now_s)
 
-    def exchange(
-        self, predictor: Model, tile: Tile | None, lanes: CenterlineSource | None
-    ) -> None:
+    def exchange(self, predictor: Model, tile: Tile | None, lanes: CenterlineSource | None) -> None:
         """From the next cycle on, predict with these; `lanes` are `lanes_for` the two.
 
         Tracks and ego motion stay, unless poses come as latitude and longitude and the new tile's

@@ -35,6 +35,12 @@ COUNTED = {
     "pipeline_fallbacks": Counted(
         "fallback", "the model's prediction was refused for {} targets", Level.INFO
     ),
+    "pipeline_shed": Counted("shed", "no time for the model on {} targets; physics instead"),
+    "pipeline_model_errors": Counted("model-error", "the model failed {} times"),
+    "pipeline_model_overruns": Counted(
+        "model-overrun", "the model did not answer in time, {} times"
+    ),
+    "pipeline_model_restarts": Counted("model-restart", "the model was loaded anew {} times"),
     "decoder_bad_checksum": Counted("checksum", "{} messages with a wrong checksum"),
     "ego_pose_jumps": Counted("pose-jump", "the ego's pose jumped {} times; tracks begin again"),
     "tracks_dropped": Counted("tracks-full", "{} tracks were dropped: more objects than fit"),

@@ -18,6 +18,7 @@ from eqrt.runtime.operation.realtime import stand_back
 from eqrt.runtime.pipeline import Pipeline, lanes_for
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import Tile, load_tile
+from eqrt.runtime.prediction.watched import Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ class Reloader:
         self._log.say(Level.INFO, "reload", f"reloaded: {after}, before {before}")
 
 
-def identity(predictor: Predictor, tile: Tile | None) -> str:
+def identity(predictor: Model, tile: Tile | None) -> str:
     """What predicts, in a line."""
     name = f"model {predictor.contract.name} {predictor.model_id}"
     return f"{name}, tile {tile.info.tile_id if tile else 'none'}"
