@@ -9,7 +9,7 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint conformance conformance-table bench figures clean
+.PHONY: help demo test test-runtime lint conformance conformance-table bench figures under-load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -40,6 +40,9 @@ bench: $(VENV)/.installed ## measure against the budgets, in 9 minutes; wants a 
 
 figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, measured; wants it quiet
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/figures.py
+
+under-load: $(RUNTIME_VENV)/.installed ## measure the service beside three busy programs, with and without [realtime]; needs its rights
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/under_load.py
 
 clean: ## remove the environments and everything else that was made here
 	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis .conformance
