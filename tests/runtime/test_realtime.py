@@ -154,7 +154,7 @@ from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.operation.realtime import Sweeper
 from eqrt.runtime.pipeline import Pipeline
 pipeline = Pipeline(load_profile("generic"), shipped_predictor())
-sweeper = Sweeper(pipeline)
+sweeper = Sweeper(lambda: pipeline.counters.cycles)
 inside, collected = [False], []
 gc.callbacks.append(lambda phase, info: collected.append(inside[0]) if phase == "start" else None)
 for message in traffic([Car(object_id=1, x_m=5.0, y_m=0.0)], 20.0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import tomllib
 from pathlib import Path
 
@@ -197,6 +198,16 @@ def test_the_example_is_the_defaults_with_every_key_explained() -> None:
     told = tomllib.loads(text.replace("\n#", "\n").replace("\n ", "\n# "))
     keys = {(s.option.table, s.option.key) for s in found}
     assert {(table, key) for table, values in told.items() for key in values} == keys
+
+
+def test_the_documentation_has_every_key_with_what_it_takes() -> None:
+    """A row for each, and no row for another."""
+    text = (ROOT / "docs/operations.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `\[(\w+)\]` `(\w+)` \| `(--[\w-]+)` \| (.+?) \|", text, re.MULTILINE)
+    assert rows == [
+        (o.table, o.key, o.flag, o.expected.removesuffix(', as in ["..."]'))
+        for o in (setting.option for setting in every_setting())
+    ]
 
 
 def test_serve_prints_its_configuration_and_ends(tmp_path: Path) -> None:

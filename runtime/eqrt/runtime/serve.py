@@ -136,7 +136,9 @@ def _surroundings(
     observers: list[Observer] = [] if args.quiet else [partial(_say, log)]
     observers.append(Changes(log))
     observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
-    chores: list[Chore] = [Sweeper(pipeline)] if args.realtime_gc_between_cycles else []
+    chores: list[Chore] = []
+    if args.realtime_gc_between_cycles:
+        chores.append(Sweeper(lambda: pipeline.counters.cycles))
     if endpoint is not None:
         observers.append(endpoint.observe)
         chores.append(endpoint)

@@ -43,6 +43,9 @@ class FileOrName(str):
         return bool(path.suffix) or path.name != self
 
 
+_TEXTS = (None, str, Path, FileOrName)
+
+
 @dataclass(frozen=True, slots=True)
 class Option:
     """An option of the command line, and the key that it is in a file."""
@@ -74,7 +77,10 @@ class Option:
             return " or ".join(f'"{choice}"' for choice in self.action.choices)
         if self.action.type is int:
             return "an integer"
-        return "a number" if self.action.type is float else "a string"
+        if self.action.type is float:
+            return "a number"
+        is_text = self.action.type in _TEXTS
+        return "a string" if is_text else "a string or an integer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +281,7 @@ def line_of(text: str, place: Sequence[str]) -> int:
 def _is_scalar(value: object, kind: object) -> bool:
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
-    if kind in (None, str, Path, FileOrName):
+    if kind in _TEXTS:
         return isinstance(value, str)
     if kind is int:
         return type(value) is int

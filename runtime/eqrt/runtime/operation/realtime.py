@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.pipeline import Pipeline
 
 MAX_PRIORITY = 99
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # mlockall(2), the same on all of Linux's CPUs
@@ -140,13 +139,15 @@ def refuse(problems: list[str]) -> None:
 class Sweeper:
     """Collects garbage between cycles (`service.Chore`) instead of whenever Python would."""
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    def __init__(self, cycles: Callable[[], int]) -> None:
+        """`cycles` tells how many predictions have been made."""
         gc.disable()
-        self._pipeline = pipeline
+        self._cycles = cycles
         self._due_cycle = _COLLECT_CYCLES
 
     def __call__(self) -> None:
         """Now and then, right after a prediction has been sent."""
-        if self._pipeline.counters.cycles >= self._due_cycle:
-            self._due_cycle = self._pipeline.counters.cycles + _COLLECT_CYCLES
+        cycles = self._cycles()
+        if cycles >= self._due_cycle:
+            self._due_cycle = cycles + _COLLECT_CYCLES
             gc.collect()

@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
+from eqrt.runtime.operation.realtime import stand_back
 from eqrt.runtime.prediction.predictor import Prediction
 
 STUCK_S = 2.0
@@ -193,6 +194,7 @@ class _Successor:
         self._thread.start()
 
     def _load(self, model: Model) -> None:
+        stand_back()
         try:
             self.model = model.again()
         except (EqrtError, OSError):
