@@ -83,7 +83,7 @@ def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:
     path = tmp_path / "far.tile"
     save_tile(path, encode(far, tile.info))
     ends = []
-    for first, then in ((TILE, None), (TILE, path), (path, None)):
+    for first, then in ((TILE, None), (TILE, path), (path, None), (path, TILE)):
         pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(first))
         said(pipeline, traffic(CARS, 3.0, pose=POSE))
         if then:
@@ -92,6 +92,7 @@ def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:
         ends.append(after.trajectories)
     assert not np.allclose(ends[0], ends[1], atol=1e-3)
     np.testing.assert_allclose(ends[1], ends[2], atol=1e-9)
+    np.testing.assert_allclose(ends[0], ends[3], atol=1e-9)
 
 
 def test_poses_in_map_coordinates_do_not_care_where_the_tile_says_its_origin_is(
