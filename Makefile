@@ -9,7 +9,7 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint conformance conformance-table bench figures under-load clean
+.PHONY: help demo test test-runtime lint conformance conformance-table bench figures load under-load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -43,6 +43,9 @@ figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, mea
 
 under-load: $(RUNTIME_VENV)/.installed ## measure the service beside three busy programs, with and without [realtime]; needs its rights
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/under_load.py
+
+load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a service, in 2 minutes; nothing may be lost
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60
 
 clean: ## remove the environments and everything else that was made here
 	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis .conformance

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from eqrt.runtime.decoding.checksums import Checksum, crc8, sum8, xor8
+from eqrt.runtime.decoding.checksums import Checksum, sum8, xor8
+from eqrt.runtime.protection.crc import crc_of
 
 
 @pytest.mark.parametrize(
@@ -18,7 +19,7 @@ from eqrt.runtime.decoding.checksums import Checksum, crc8, sum8, xor8
 def test_crc8_of_the_nine_digits_is_as_published(
     start: int, polynomial: int, final_xor: int, check: int
 ) -> None:
-    assert crc8(polynomial, start, final_xor)(b"123456789") == check
+    assert crc_of(8, polynomial, start, final_xor)(b"123456789") == check
 
 
 def test_sum8_and_xor8_by_hand() -> None:

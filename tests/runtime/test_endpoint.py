@@ -33,6 +33,7 @@ from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.status_book import StatusBook
+from no_channels import NoChannels
 from processes import PATIENCE_S, Serving
 from source_tree import ROOT
 
@@ -43,7 +44,7 @@ SAMPLE = re.compile(r'^(\w+)(?:\{((?:\w+="(?:[^"\\\n]|\\[\\"n])*",?)+)\})? (\S+)
 def status() -> ServiceStatus:
     """Of a service that has just begun, with everything that a status can have."""
     pipeline = Pipeline(load_profile("ars408"), shipped_predictor())
-    made = StatusBook(pipeline, []).close(time.monotonic() + 1.0)
+    made = StatusBook(pipeline, NoChannels(), []).close(time.monotonic() + 1.0)
     return msgspec.structs.replace(
         made,
         mode=int(Mode.RUN),

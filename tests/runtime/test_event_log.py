@@ -19,6 +19,7 @@ from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.status_book import StatusBook
+from no_channels import NoChannels
 
 
 class Heard:
@@ -106,7 +107,8 @@ def test_lines_that_are_always_said_are_not_counted() -> None:
 def quiet() -> ServiceStatus:
     """Of a service before its first cycle."""
     pipeline = Pipeline(load_profile("ars408"), shipped_predictor())
-    return StatusBook(pipeline, []).close(time.monotonic() + 1.0)
+    made = StatusBook(pipeline, NoChannels(), []).close(time.monotonic() + 1.0)
+    return msgspec.structs.replace(made, sources=[])
 
 
 def told(*statuses: ServiceStatus) -> list[str]:

@@ -197,6 +197,12 @@ def test_an_object_measured_to_be_faster_than_its_class_may_go_on() -> None:
     assert not accepted(kind, speed_mps, speeding_up(speed_mps, 6.0, 30.1))
 
 
+def test_nothing_is_faster_than_anything_on_a_road() -> None:
+    """However fast the sensor says that it is."""
+    assert accepted(ObjectClass.TRUCK, 88.0, speeding_up(88.0, 6.0, 89.9))
+    assert not accepted(ObjectClass.TRUCK, 88.0, speeding_up(88.0, 6.0, 90.1))
+
+
 @pytest.mark.parametrize("kind", ObjectClass)
 def test_every_class_has_its_speeding_up_and_braking(kind: ObjectClass) -> None:
     limit = LIMITS[kind].along_mps2

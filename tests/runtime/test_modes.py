@@ -42,6 +42,7 @@ def test_a_clock_that_was_set_back_does_not_hold_a_mode_for_hours() -> None:
     keeper = ModeKeeper()
     keeper.cycle({Mode.LATE}, 5000.0)
     assert keeper.cycle(set(), 100.0) is Mode.RUN
+    assert keeper.cycle(set(), 5000.1) is Mode.RUN
 
 
 @given(st.lists(st.tuples(REASONS, st.floats(0.001, 1.0)), max_size=40))

@@ -184,6 +184,48 @@ def test_a_clock_that_was_set_back_starts_anew() -> None:
     assert late.timestamp_s == pytest.approx(102.1)
 
 
+def test_silence_is_said_after_a_clock_that_was_set_back() -> None:
+    """Not an hour later."""
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 1.0, start_s=5000.0))
+    said = poll(pipeline, 100.0, 101.0)
+    assert {forecast.mode for forecast in said} == {Mode.SILENT}
+    assert 100.28 <= said[0].made_s <= 100.32
+
+
+def test_cycles_that_are_too_old_to_be_predicted_do_not_put_silence_off() -> None:
+    """What comes was measured before what has been predicted: half a second late."""
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 1.0))
+    said = []
+    for step in range(5):
+        late = cycle(CARS, 1.1 + 0.1 * step)
+        for message in aged(late, by_s=0.6):
+            said += [*pipeline.poll(message.timestamp), *pipeline.feed(message, message.timestamp)]
+    assert {forecast.mode for forecast in said} == {Mode.SILENT}
+    assert pipeline.counters.skipped > 0
+
+
+def test_a_cycle_that_says_it_is_seconds_old_is_not_used_and_undoes_nothing() -> None:
+    """A flipped bit in the stated age: the histories go on."""
+    pipeline = pipeline_of()
+    feed(pipeline, traffic(CARS, 2.0))
+    assert feed(pipeline, aged(cycle(CARS, 2.1), by_s=5.0)) == []
+    assert pipeline.counters.stale > 0
+    (forecast,) = feed(pipeline, cycle(CARS, 2.2))
+    assert set(forecast.agent_mode.tolist()) == {Mode.RUN}
+    assert pipeline.tracks.counters.resets == 0
+
+
+def aged(messages: Iterable[can.Message], by_s: float) -> list[can.Message]:
+    """The same, but the header of the object list says that it was measured so long before."""
+    made = list(messages)
+    for message in made:
+        if message.arbitration_id == 0x5A3:
+            message.data[2:4] = round(1e4 * by_s).to_bytes(2, "little")  # AGE, 0.1 ms per bit
+    return made
+
+
 def test_an_unfinished_cycle_is_predicted_when_its_time_is_over() -> None:
     """Its first car came whole, of the second only the position."""
     pipeline = pipeline_of()

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from drives import shipped_predictor
 from eqrt.core.errors import ContractError
 from eqrt.core.scene import Scene
-from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor, open_session
 from eqrt.runtime.prediction.tensor_proto import parse_tensor, read_tensor
 from processes import environment
 
@@ -164,6 +164,16 @@ def another_contract(folder: Path) -> None:
     replace_in_model(folder, b'"num_agents": 16', b'"num_agents": 17')
 
 
+def weights_in_another_file(folder: Path) -> None:
+    """One more initializer, of which the file says only where it is; onnxruntime loads that."""
+    location = b"\x0a\x08location\x12\x09other.bin"
+    weights = b"\x08\x01" + b"\x10\x01" + b"\x42\x05extra" + b"\x6a\x15" + location + b"\x70\x01"
+    graph = b"\x2a" + bytes([len(weights)]) + weights
+    content = (folder / "model.onnx").read_bytes()
+    give_model(folder, content + b"\x3a" + bytes([len(graph)]) + graph)
+    open_session((folder / "model.onnx").read_bytes(), 1)
+
+
 def no_vectors(folder: Path) -> None:
     shutil.rmtree(folder / VECTORS[0].name)
 
@@ -200,6 +210,7 @@ DAMAGES: dict[Callable[[Path], None], str] = {
     another_kind_of_model: r"no 'eqrt_contract' metadata, so this is not an eqrt model",
     another_schema: r"schema 7 is not supported \(this runtime speaks 1\); re-export",
     another_contract: r"tensor 'history' is .* the contract says .*export the model again",
+    weights_in_another_file: "the weights of 'extra' are in another file; export the model as one",
     no_vectors: r"no test_data_set_\*; export the model again",
     half_a_vector: r"input_0\.pb: not a float32 or bool tensor \(truncated\)",
     a_vector_of_another_shape: r"input_3\.pb: centerlines is .*, the contract says float32",

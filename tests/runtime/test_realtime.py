@@ -43,9 +43,9 @@ def without_rights() -> list[str]:
 
 
 def refused(*more: str) -> subprocess.CompletedProcess[str]:
-    """`eqrt serve` without rights, ended after a second if it does not end by itself."""
+    """`eqrt serve` without rights, ended after ten seconds if it does not end by itself."""
     return subprocess.run(
-        ["timeout", "--signal=TERM", "3", *without_rights(), *EQRT, "serve", *options(*more)],
+        ["timeout", "--signal=TERM", "10", *without_rights(), *EQRT, "serve", *options(*more)],
         capture_output=True,
         text=True,
         check=False,

@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import can
@@ -204,9 +205,16 @@ def test_a_running_service_exchanges_tile_and_model_without_missing_a_cycle(
         status, stdout, stderr = service.end()
     assert (status, stderr) == (0, "")
     cycles = [one for one in heard.forecasts if one.mode is not Mode.SILENT]
-    assert [one.cycle for one in cycles] == list(range(len(cycles)))
+    assert [one.cycle for one in heard.forecasts] == list(range(len(heard.forecasts)))
     assert drive.cycles - 1 <= len(cycles) <= drive.cycles
-    assert len({one.track_id.tolist()[0] for one in cycles if one.num_targets}) == 1
+    swaps = [
+        (old, new)
+        for old, new in pairwise(cycles)
+        if (old.tile_id, old.model_id) != (new.tile_id, new.model_id) and old.num_targets
+    ]
+    assert len(swaps) == 2
+    for old, new in swaps:
+        assert new.track_id.tolist() == old.track_id.tolist()
     *_, after = cycles
     assert (after.tile_id, after.history.shape[1]) == (second_tile, CONTRACT.history_steps)
     events = re.sub(r"\d\d:\d\d:\d\d ", "", stdout)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import re
 import signal
 import time
 from collections import defaultdict
@@ -31,6 +32,7 @@ from source_tree import ROOT
 DBC = ROOT / "runtime/eqrt/runtime/output/eqrt.dbc"
 OUTPUT_IDS = range(0x6E0, 0x6E6)
 SECONDS = 3.0
+ARS408_IDS = load_profile("ars408").ids
 RESOLUTION_M = 0.02  # of positions in eqrt.dbc
 CHANNELS = (f"serve-{number}-{time.monotonic_ns()}" for number in itertools.count())
 
@@ -257,30 +259,40 @@ def test_garbage_on_the_bus_is_counted_and_skipped() -> None:
     """Random ids and bytes, other lengths, error and remote frames, between a radar's messages."""
     channel = next(CHANNELS)
     lines = first_seconds(DRIVES["ars408"].log, 1.5).splitlines()
-    random = np.random.default_rng(0)
+    random, wanted = np.random.default_rng(0), 0
     with (
         Heard(channel, OUTPUT_IDS) as heard,
         Serving("--can", channel, "--can-interface", LOCAL, "--profile", "ars408") as service,
         open_bus(channel, LOCAL) as bus,
     ):
         for message in map(candump_message, lines):
-            for garbage in garbage_messages(random):
-                bus.send(garbage)
-            bus.send(message)
+            for one in (*garbage_messages(random), message):
+                bus.send(one)
+                wanted += is_wanted(one)
             time.sleep(0.004)
         time.sleep(0.5)
         status, stdout, stderr = service.end(signal.SIGTERM)
     assert (status, stderr) == (0, "")
     summary = stdout.splitlines()[-1]
-    unusable = int(summary.split()[-2])
-    assert summary.endswith(" unusable")
-    assert unusable > len(lines)
+    found = re.search(r" (\d+) messages, .* (\d+) unusable; \S+: (\d+) error frames", summary)
+    assert found, summary
+    messages, unusable, error_frames = map(int, found.groups())
+    assert messages == wanted
+    assert unusable > len(lines) / 2
+    assert error_frames == len(lines)
     cycles = by_cycle(heard.messages)
     assert len(cycles) > 5
     assert sum(len(rows) for _, rows in cycles) > 5
     for status_fields, rows in cycles:
         assert status_fields["NumObjects"] == len(rows)
         assert all(np.isfinite([fields["X1"], fields["Y10"]]).all() for fields in rows)
+
+
+def is_wanted(message: can.Message) -> bool:
+    """Whether it has an id of the profile and is no remote or error frame, whatever its data."""
+    address = (message.arbitration_id, message.is_extended_id)
+    is_data = not message.is_remote_frame and not message.is_error_frame
+    return is_data and address in ARS408_IDS
 
 
 def garbage_messages(random: np.random.Generator) -> Iterator[can.Message]:

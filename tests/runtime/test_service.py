@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import signal
 import threading
 import time
 from collections import deque
@@ -17,15 +16,16 @@ import numpy as np
 import pytest
 
 from drives import DRIVES, first_seconds, shipped_predictor
-from eqrt.core.errors import BusError
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.bus.links import opener
+from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.play import OTHERS, Player
-from eqrt.runtime.serve import Merged
 from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Service
 from eqrt.runtime.status_book import StatusBook, status_line
 from forecast_sets import many, nobody, one_car
@@ -127,6 +127,12 @@ class Queue:
         time.sleep(timeout or 0.0)
         return None
 
+    def health(self) -> list[BusHealth]:
+        return []
+
+    def counts(self) -> dict[str, int]:
+        return {"left": len(self.messages)}
+
     def is_over(self) -> bool:
         return not self.messages and time.monotonic() >= self._end_s
 
@@ -162,13 +168,16 @@ def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> 
     channel = next(CHANNELS)
     statuses: list[ServiceStatus] = []
     lines = first_seconds(DRIVES["ars408"].log, 2.3).splitlines()
-    with open_bus(channel, LOCAL) as car, open_bus(channel, LOCAL) as bus:
+    with (
+        open_bus(channel, LOCAL) as car,
+        Receiver(opener(LOCAL, fd=None), {channel: None}, pytest.fail) as receiver,
+    ):
         play = Player({OTHERS: car}).play
         player = threading.Thread(
             target=play, args=(list(map(candump_message, lines)), lambda: False)
         )
         player.start()
-        Service(radar, bus, [Said()], [statuses.append]).run(lambda: not player.is_alive())
+        Service(radar, receiver, [Said()], [statuses.append]).run(lambda: not player.is_alive())
         player.join()
     assert len(statuses) == 2
     for status in statuses:
@@ -184,69 +193,17 @@ def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> 
     assert first.totals["decoder_messages"] == first.messages
     assert last.totals["decoder_messages"] == first.messages + last.messages
     assert last.totals["said"] == last.totals["pipeline_cycles"] > first.totals["said"] > 0
+    assert (last.totals["bus_losses"], last.totals["bus_dropped"]) == (0, 0)
+    (bus,) = last.buses
+    assert (bus.channel, bus.state, bus.losses, bus.overflow) == (channel, "UP", 0, 0)
+    assert 2.0 <= bus.since_s < 60.0
+    assert [one.name for one in last.sources] == [
+        "ars408",
+        "ego SpeedInformation",
+        "ego YawRateInformation",
+    ]
+    assert all(one.valid and not one.reason and one.since_s > 0.0 for one in last.sources)
     assert set(first.stages_s) == {"tracks", "scene", "infer", "guard"}
-
-
-def test_a_bus_that_goes_away_ends_the_service_with_an_explanation(radar: Pipeline) -> None:
-    bus = open_bus(next(CHANNELS), LOCAL)
-    bus.shutdown()
-    with pytest.raises(BusError, match=r"can no longer be read .*start again"):
-        Service(radar, bus, []).run(lambda: False)
-
-
-# --- several buses as one
-
-
-def test_messages_of_several_buses_come_with_the_names_of_their_channels() -> None:
-    names = [next(CHANNELS), next(CHANNELS)]
-    buses = {name: open_bus(name, "virtual") for name in names}
-    senders = {name: open_bus(name, "virtual") for name in names}
-    with Merged(buses) as merged:
-        for number, name in enumerate(names * 2):
-            senders[name].send(can.Message(arbitration_id=number))
-        heard = [merged.recv(5.0) for _ in range(4)]
-        assert merged.recv(0.01) is None
-    found = {(m.arbitration_id, m.channel) for m in heard if m is not None}
-    assert found == {(0, names[0]), (1, names[1]), (2, names[0]), (3, names[1])}
-    close([*buses.values(), *senders.values()])
-
-
-def test_a_bus_that_fails_is_not_taken_for_a_silent_one(radar: Pipeline) -> None:
-    """python-can reads it in a thread, whose error must not be lost."""
-    names = [next(CHANNELS), next(CHANNELS)]
-    buses = {name: open_bus(name, LOCAL) for name in names}
-    with Merged(buses) as merged:
-        buses[names[1]].shutdown()
-        with pytest.raises(BusError, match="can no longer be read"):
-            Service(radar, merged, []).run(lambda: False)
-    close(buses.values())
-
-
-def test_a_signal_does_not_make_the_wait_for_messages_endless() -> None:
-    """Timers fire while it waits; whenever that is, it must come back after its 2 ms."""
-    names = [next(CHANNELS), next(CHANNELS)]
-    buses = {name: open_bus(name, "virtual") for name in names}
-    other = open_bus(names[0], "virtual")
-    fired = []
-    before = signal.signal(signal.SIGALRM, lambda *_: fired.append(time.monotonic()))
-    with Merged(buses) as merged:
-        signal.setitimer(signal.ITIMER_REAL, 0.0007, 0.0007)
-        rescue = threading.Timer(60.0, other.send, [can.Message()])  # fails instead of hanging
-        rescue.start()
-        try:
-            for _ in range(500):
-                assert merged.recv(0.002) is None
-        finally:
-            rescue.cancel()
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, before)
-    assert len(fired) > 500
-    close([*buses.values(), other])
-
-
-def close(buses: Iterable[can.BusABC]) -> None:
-    for bus in buses:
-        bus.shutdown()
 
 
 # --- what is said
@@ -254,7 +211,7 @@ def close(buses: Iterable[can.BusABC]) -> None:
 
 def book(pipeline: Pipeline, forecasts: Iterable[ForecastSet]) -> StatusBook:
     """Of a service that has said these, each 12 ms after its last message came."""
-    found = StatusBook(pipeline, [])
+    found = StatusBook(pipeline, Queue(0.1), [])
     for forecast in forecasts:
         found.published(forecast, time.monotonic() - 0.012)
         pipeline.counters.cycles += 1

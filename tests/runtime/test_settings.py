@@ -194,7 +194,11 @@ def test_the_example_is_the_defaults_with_every_key_explained() -> None:
     """Read as it is, and with every key that is commented out."""
     text = EXAMPLE.read_text(encoding="utf-8")
     found = resolved("--config", str(EXAMPLE))
-    assert {s.option.key for s in found if s.source != DEFAULT} == {"profile", "can"}
+    assert {s.option.key for s in found if s.source != DEFAULT} == {
+        "profile",
+        "can",
+        "wait_for_bus",
+    }
     told = tomllib.loads(text.replace("\n#", "\n").replace("\n ", "\n# "))
     keys = {(s.option.table, s.option.key) for s in found}
     assert {(table, key) for table, values in told.items() for key in values} == keys

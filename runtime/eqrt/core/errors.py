@@ -36,5 +36,9 @@ class BusError(EqrtError):
     """A CAN channel cannot be opened or written."""
 
 
+class AbsentBusError(BusError):
+    """A CAN channel is not there, or down; it may still come."""
+
+
 class LogError(EqrtError):
     """A recorded log cannot be read."""

@@ -40,8 +40,11 @@ NEIGHBOR_AGE_S = 0.5
 SHED_PERIODS = 0.7
 """Of the model's period, counted from the arrival of a cycle's last message: what could not be
 predicted by then is left to physics, so that the rest leaves in time and nothing queues up."""
+MAX_INPUT_AGE_S = 1.0
+"""Input that is older when it comes is not used: sensors may say how old their measurements are,
+and a bit that is flipped there must not undo everything that came since."""
 SILENT_PERIODS = 3
-"""After this many model steps without a cycle, everything said before is void."""
+"""After this many model steps without a prediction, everything said before is void."""
 _FINISH_S = 1.0  # longer than any profile's timeout
 _CONTROL_S = 0.01  # how often silence and unfinished cycles are looked for
 _MAX_CLOCK_STEP_S = 1.0  # a cycle older than the newest by more: the clock was set back
@@ -74,6 +77,8 @@ class PipelineCounters:
     """Runs that were given up because their time was over."""
     model_restarts: int = 0
     """Times that the model was loaded anew because it was stuck or kept failing."""
+    stale: int = 0
+    """Cycles and ego messages that say themselves that they are older than MAX_INPUT_AGE_S."""
     skipped: int = 0
     """Sensor cycles measured before or too soon after a prediction to get their own."""
 
@@ -131,8 +136,10 @@ class Pipeline:
             return _NOTHING
         self._controlled_s = now_s
         made = self._handle_all(self.decoder.poll(now_s), now_s)
+        dt_s = self.predictor.contract.dt_s
+        if np.isfinite(self._silent_due_s):  # a clock that was set back
+            self._silent_due_s = min(self._silent_due_s, now_s + SILENT_PERIODS * dt_s)
         if now_s >= self._silent_due_s and not made:
-            dt_s = self.predictor.contract.dt_s
             self._silent_due_s = now_s + dt_s - (now_s - self._silent_due_s) % dt_s
             made.append(self._silence(now_s))
         return made
@@ -162,6 +169,9 @@ class Pipeline:
         return [made for event in events if (made := self._handle(event, now_s)) is not None]
 
     def _handle(self, event: Event, now_s: float) -> ForecastSet | None:
+        if now_s - event.timestamp_s > MAX_INPUT_AGE_S:
+            self.counters.stale += 1
+            return None
         if isinstance(event, EgoMotion):
             self.ego.motion(event)
             return None
@@ -175,12 +185,12 @@ class Pipeline:
         timestamp_s = detections.timestamp_s
         ego = self.ego.at(timestamp_s)
         self.tracks.update(detections, ego, self.profile.sensor(detections.sensor).mount)
-        self._silent_due_s = now_s + SILENT_PERIODS * self.predictor.contract.dt_s
         since_s = timestamp_s - self._predicted_s
         if -_MAX_CLOCK_STEP_S <= since_s < MIN_PERIOD * self.predictor.contract.dt_s:
             self.counters.skipped += 1
             return None
         self._predicted_s = timestamp_s
+        self._silent_due_s = now_s + SILENT_PERIODS * self.predictor.contract.dt_s
         self.times.tracks_s = self._time(now_s) - started_s
         return self._predict(ego, _Moment(timestamp_s, now_s, started_s))
 

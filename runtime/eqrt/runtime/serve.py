@@ -7,15 +7,14 @@ import contextlib
 import gc
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from queue import Empty, Queue
-
-import can
+from collections.abc import Callable, Sequence
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.bus.buses import open_bus
 from eqrt.runtime.bus.channels import parse_channels
+from eqrt.runtime.bus.health import in_sum, trouble
+from eqrt.runtime.bus.ids import Ids
+from eqrt.runtime.bus.links import opener
+from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import Profile, load_profile
 from eqrt.runtime.operation.changes import Changes
 from eqrt.runtime.operation.endpoint import Endpoint
@@ -31,13 +30,12 @@ from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.serve_options import NO_CHANNEL, add_arguments
-from eqrt.runtime.service import Chore, Observer, Publisher, Receiver, Service
+from eqrt.runtime.service import Chore, Observer, Publisher, Service
 from eqrt.runtime.settings import as_toml, namespace
 from eqrt.runtime.signals import asked_to_reload, until_told_to_stop
 from eqrt.runtime.status_book import status_line
 
 __all__ = ["add_arguments", "run"]
-_NOTICE_END_S = 0.1  # how often a thread of python-can looks whether it is to end
 
 
 def load_pipeline(
@@ -77,17 +75,19 @@ def _serve(args: argparse.Namespace) -> int:
         should_stop = stack.enter_context(until_told_to_stop())
         is_asked = stack.enter_context(asked_to_reload())
         _become_realtime(args, log)
-        buses = _open_buses(args, profile, sorted(set(channels.values())), stack)
-        several = channels if len(buses) > 1 else None
+        heard = sorted(set(channels.values()))
+        receiver = stack.enter_context(_receiver(args, profile, heard))
+        several = channels if len(heard) > 1 else None
         pipeline = load_pipeline(args, profile, several, clock=time.monotonic)
-        publishers = _publishers(args, buses, stack)
-        receiver = _receiver(buses, stack)
+        publishers = _publishers(args, receiver, stack)
         manager = stack.enter_context(ServiceManager.of())
         reloader = Reloader(
             pipeline, args.model, args.tile, is_asked=is_asked, log=log, tell=manager.reload
         )
         endpoint = _endpoint(args, stack)
-        observers, chores = _surroundings(args, pipeline, publishers, log, endpoint)
+        observers, chores = _surroundings(
+            args, pipeline, receiver, publishers, log=log, endpoint=endpoint
+        )
         service = Service(
             pipeline,
             receiver,
@@ -96,14 +96,15 @@ def _serve(args: argparse.Namespace) -> int:
             chores=[*chores, reloader, manager],
         )
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
-        log.line("ready", f"eqrt serve: {profile.name} on {', '.join(buses)}; Ctrl-C ends")
+        log.line("ready", f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends")
         log.say(Level.INFO, "running", identity(pipeline.predictor, pipeline.tile))
         if endpoint is not None:
             log.say(Level.INFO, "metrics", f"http://{endpoint.address}/metrics and /health answer")
         manager.ready()
         service.run(should_stop)
         manager.stopping()
-    log.line("end", f"eqrt serve: {_summary(pipeline)}")
+        troubles = in_sum(receiver.health())
+    log.line("end", f"eqrt serve: {_summary(pipeline)}" + (f"; {troubles}" if troubles else ""))
     return 0
 
 
@@ -128,12 +129,14 @@ def _endpoint(args: argparse.Namespace, stack: contextlib.ExitStack) -> Endpoint
 def _surroundings(
     args: argparse.Namespace,
     pipeline: Pipeline,
+    receiver: Receiver,
     publishers: Sequence[Publisher],
+    *,
     log: EventLog,
     endpoint: Endpoint | None,
 ) -> tuple[list[Observer], list[Chore]]:
     """Who is told every second, and what is done between messages."""
-    observers: list[Observer] = [] if args.quiet else [partial(_say, log)]
+    observers: list[Observer] = [] if args.quiet else [_Teller(log, receiver).say]
     observers.append(Changes(log))
     observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
     chores: list[Chore] = []
@@ -145,82 +148,27 @@ def _surroundings(
     return observers, chores
 
 
-def _open_buses(
-    args: argparse.Namespace, profile: Profile, channels: list[str], stack: contextlib.ExitStack
-) -> dict[str, can.BusABC]:
-    return {
-        channel: stack.enter_context(
-            open_bus(channel, args.can_interface, fd=args.fd, receive_ids=profile.arbitration_ids)
-        )
-        for channel in channels
-    }
+def _receiver(args: argparse.Namespace, profile: Profile, channels: Sequence[str]) -> Receiver:
+    """Reads `channels`, and opens the one that predictions go to, if it is another, for sending."""
+    wanted: dict[str, Ids | None] = dict.fromkeys(channels, profile.ids)
+    if (out := _out_channel(args)) is not None:
+        wanted.setdefault(out, ())
+    return Receiver(opener(args.can_interface, fd=args.fd), wanted, _warn, wait=args.wait_for_bus)
 
 
-def _receiver(buses: Mapping[str, can.BusABC], stack: contextlib.ExitStack) -> Receiver:
-    """One bus is read directly; several, in python-can's threads."""
-    if len(buses) == 1:
-        return next(iter(buses.values()))
-    return stack.enter_context(Merged(buses))
-
-
-class Merged:
-    """Several buses read as one, each by a thread of python-can's."""
-
-    def __init__(self, buses: Mapping[str, can.BusABC]) -> None:
-        # Not SimpleQueue: up to Python 3.12, a signal late in its wait makes the wait endless.
-        self._heard: Queue[can.Message | Exception] = Queue()
-        self._notifiers = [
-            can.Notifier(bus, [_Ear(channel, self._heard)], timeout=_NOTICE_END_S)
-            for channel, bus in buses.items()
-        ]
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next message of any bus; its channel is the name that the bus was opened by.
-
-        Raises can.CanOperationError if a bus can no longer be read.
-        """
-        try:
-            heard = self._heard.get(timeout=timeout)
-        except Empty:
-            return None
-        if isinstance(heard, Exception):
-            raise can.CanOperationError(str(heard)) from heard
-        return heard
-
-    def __enter__(self) -> Merged:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for notifier in self._notifiers:
-            notifier.stop()
-
-
-class _Ear(can.Listener):
-    """Puts what a bus's thread hears where the main thread reads."""
-
-    def __init__(self, channel: str, heard: Queue[can.Message | Exception]) -> None:
-        self._channel = channel
-        self._heard = heard
-
-    def on_message_received(self, msg: can.Message) -> None:
-        msg.channel = self._channel  # some interfaces keep the sender's name for it
-        self._heard.put(msg)
-
-    def on_error(self, exc: Exception) -> None:
-        self._heard.put(exc)
+def _out_channel(args: argparse.Namespace) -> str | None:
+    """Where predictions go on CAN; None = nowhere."""
+    if args.out_can == NO_CHANNEL:
+        return None
+    return str(args.out_can or args.can[0].rpartition("=")[2])
 
 
 def _publishers(
-    args: argparse.Namespace, buses: dict[str, can.BusABC], stack: contextlib.ExitStack
+    args: argparse.Namespace, receiver: Receiver, stack: contextlib.ExitStack
 ) -> list[Publisher]:
     publishers: list[Publisher] = []
-    if args.out_can != NO_CHANNEL:
-        channel = args.out_can or args.can[0].rpartition("=")[2]
-        bus = buses.get(channel)
-        if bus is None:
-            bus = stack.enter_context(
-                open_bus(channel, args.can_interface, fd=args.fd, receive_ids=[])
-            )
+    if (out := _out_channel(args)) is not None:
+        bus = receiver.connection(out)
         publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
     elif not args.datagrams:
         raise UsageError("--out-can none and no --datagrams: the predictions would go nowhere")
@@ -229,19 +177,35 @@ def _publishers(
     return publishers
 
 
-def _say(log: EventLog, status: ServiceStatus) -> None:
-    text = status_line(status)
-    if log.is_json:
-        log.line(
+class _Teller:
+    """Says every second how the service is, and what is wrong with its channels."""
+
+    def __init__(self, log: EventLog, receiver: Receiver) -> None:
+        self._log = log
+        self._receiver = receiver
+        self._before = receiver.health()
+
+    def say(self, status: ServiceStatus) -> None:
+        """With what has happened to the channels since the last line."""
+        health = self._receiver.health()
+        text = trouble(self._before, health, time.monotonic())
+        self._before = health
+        line = status_line(status) + (f"  {text}" if text else "")
+        if not self._log.is_json:
+            self._log.line("status", f"{time.strftime('%H:%M:%S')} {line}")
+            return
+        self._log.line(
             "status",
-            text,
+            line,
             mode=Mode(status.mode).name,
             objects=status.objects,
             messages=status.messages,
             latency_ms=[round(1e3 * latency_s, 2) for latency_s in status.latencies_s],
         )
-    else:
-        log.line("status", f"{time.strftime('%H:%M:%S')} {text}")
+
+
+def _warn(line: str) -> None:
+    print(f"eqrt serve: {line}", file=sys.stderr, flush=True)
 
 
 def _summary(pipeline: Pipeline) -> str:

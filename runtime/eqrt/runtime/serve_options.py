@@ -72,6 +72,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="send predictions as UDP datagrams too, to a viewer or recorder, such as "
         f"{DEFAULT_ADDRESS} (repeatable)",
     )
+    parser.add_argument(
+        "--wait-for-bus",
+        action=Switch,
+        help="at the start, wait for channels that are not there yet, or down (default: an error); "
+        "one that is lost later is waited for in any case",
+    )
     _add_reporting(parser)
     _add_realtime(parser)
     Settings(parser, "serve")

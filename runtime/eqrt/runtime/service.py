@@ -9,22 +9,21 @@ from typing import Protocol
 
 import can
 
-from eqrt.core.errors import BusError
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.status_book import StatusBook
+from eqrt.runtime.status_book import Channels, StatusBook
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly
 _REPORT_S = 1.0
 MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but a wall clock that was set
 
 
-class Receiver(Protocol):
-    """Where messages come from: a python-can bus, or a reader over several."""
+class Receiver(Channels, Protocol):
+    """Where messages come from: channels that may be lost and come back, while it goes on."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next message, or None after `timeout` seconds."""
+        """The next message, or None after `timeout` seconds; never raises."""
 
 
 class Clock(Protocol):
@@ -71,13 +70,13 @@ class Service:
         self._observers = observers
         self._clock = clock or ArrivalClock()
         self._chores = chores
-        self._book = StatusBook(pipeline, publishers)
+        self._book = StatusBook(pipeline, receiver, publishers)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Serve until told to stop. Raises BusError if the bus goes away."""
+        """Serve until told to stop."""
         report_due_s = time.monotonic() + _REPORT_S
         while not should_stop():
-            message = self._receive()
+            message = self._receiver.recv(_NAP_S)
             stamp_s = None if message is None else message.timestamp
             now_s = self._clock.now_s(time.monotonic(), stamp_s, time.time())
             self._publish(self._pipeline.poll(now_s), now_s)
@@ -88,14 +87,6 @@ class Service:
                 report_due_s = self._report(monotonic_s, report_due_s)
             for chore in self._chores:
                 chore()
-
-    def _receive(self) -> can.Message | None:
-        try:
-            return self._receiver.recv(_NAP_S)
-        except (can.CanError, OSError) as error:
-            raise BusError(
-                f"the CAN channel can no longer be read ({error}); when it is back, start again"
-            ) from error
 
     def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
         for forecast in forecasts:

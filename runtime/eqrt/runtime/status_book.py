@@ -10,9 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
+from eqrt.runtime.bus.health import BusHealth
 from eqrt.runtime.decoding.decoder_counters import DecoderCounters
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
-from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 from eqrt.runtime.pipeline import Pipeline, PipelineCounters
 from eqrt.runtime.tracking.ego import EgoCounters
 from eqrt.runtime.tracking.tracks import TrackCounters
@@ -25,12 +26,22 @@ class Counting(Protocol):
         """Since the start, by name."""
 
 
+class Channels(Counting, Protocol):
+    """The buses that are read."""
+
+    def health(self) -> Sequence[BusHealth]:
+        """One for each."""
+
+
 class StatusBook:
     """One period of the service after the other."""
 
-    def __init__(self, pipeline: Pipeline, counting: Sequence[Counting]) -> None:
+    def __init__(
+        self, pipeline: Pipeline, channels: Channels, publishers: Sequence[Counting]
+    ) -> None:
         self._pipeline = pipeline
-        self._counting = counting
+        self._channels = channels
+        self._counting = [channels, *publishers]
         self._version = importlib.metadata.version("eqrt")
         self._started_s = self._mode_since_s = self._begun_s = time.monotonic()
         self._mode = Mode.SILENT
@@ -72,6 +83,8 @@ class StatusBook:
             latencies_s=self._latencies_s,
             stages_s={name.removesuffix("_s"): s for name, s in asdict(pipeline.times).items()},
             totals=self._totals(),
+            buses=[_bus(one, now_s) for one in self._channels.health()],
+            sources=self._sources(now_s),
         )
         self._begun_s, self._messages, self._latencies_s = now_s, 0, []
         return status
@@ -90,6 +103,29 @@ class StatusBook:
         for one in self._counting:
             totals |= one.counts()
         return totals
+
+    def _sources(self, now_s: float) -> list[SourceStatus]:
+        return [
+            SourceStatus(
+                name=one.name,
+                valid=one.valid,
+                reason=one.reason,
+                since_s=now_s - (self._started_s if one.since_s is None else one.since_s),
+            )
+            for one in self._pipeline.decoder.sources
+        ]
+
+
+def _bus(health: BusHealth, now_s: float) -> BusStatus:
+    return BusStatus(
+        channel=health.channel,
+        state=health.state.name,
+        since_s=now_s - health.since_s,
+        reason=health.reason,
+        losses=health.losses,
+        overflow=health.dropped or 0,
+        error_frames=health.error_frames,
+    )
 
 
 def status_line(status: ServiceStatus) -> str:

@@ -13,11 +13,11 @@ import struct
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import can
 
-from eqrt.core.errors import BusError
+from eqrt.core.errors import AbsentBusError, BusError
 from eqrt.runtime.bus.local_bus import LocalBus
 
 LOCAL = "eqrt_local"
@@ -41,21 +41,23 @@ def open_bus(
 
     `interface` is python-can's name for the kind of adapter, None = socketcan. `fd` None = CAN FD
     if the channel can. Only messages with `receive_ids` are received (socketcan: filtered by the
-    kernel), perhaps none at all; None = every message. Raises BusError.
+    kernel), perhaps none at all; None = every message. Raises BusError: an AbsentBusError if
+    the channel may still come.
     """
     logging.getLogger("can").addHandler(_UNPRINTED)  # else it prints beside our one line
-    interface = interface or _default_interface()
+    interface = interface or default_interface()
     filters = None if receive_ids is None else _filters(receive_ids)
     try:
         if interface == LOCAL:
             return LocalBus(channel, filters, fd is not False)
         if interface == "socketcan":
-            fd = _check_socketcan(channel, fd)
+            fd = check_socketcan(channel, fd)
         return can.Bus(channel, interface, can_filters=filters, **_options(interface, fd))
     except BusError:
         raise
     except Exception as error:  # a driver may raise anything, and the user wants one line
-        raise BusError(_explanation(channel, interface, error)) from error
+        kind = AbsentBusError if interface in interface_names() else BusError
+        raise kind(_explanation(channel, interface, error)) from error
 
 
 def interface_names() -> list[str]:
@@ -63,12 +65,24 @@ def interface_names() -> list[str]:
     return sorted({LOCAL, *can.VALID_INTERFACES})
 
 
-def carries_fd(bus: can.BusABC) -> bool:
+class Sender(Protocol):
+    """What messages are sent on: a python-can bus, or a channel of a Receiver."""
+
+    @property
+    def protocol(self) -> can.CanProtocol:
+        """Whether it carries CAN FD."""
+
+    def send(self, msg: can.Message) -> None:
+        """Send, without waiting; can.CanError or OSError if it fails."""
+
+
+def carries_fd(bus: Sender) -> bool:
     """True if CAN FD messages can be sent on it."""
     return bus.protocol is not can.CanProtocol.CAN_20
 
 
-def _default_interface() -> str:
+def default_interface() -> str:
+    """SocketCAN; BusError on a system that has none."""
     if sys.platform == "linux":
         return "socketcan"
     names = ", ".join(interface_names())
@@ -137,19 +151,22 @@ def network_interface(name: str) -> NetworkInterface | None:
     return NetworkInterface(hardware == _CAN_HARDWARE, bool(flags & _UP), mtu)
 
 
-def _check_socketcan(channel: str, fd: bool | None) -> bool:
-    """Whether to open the channel for CAN FD; BusError if it cannot be used."""
+def check_socketcan(channel: str, fd: bool | None) -> bool:
+    """Whether to open the channel for CAN FD; BusError if it cannot be used.
+
+    An AbsentBusError if it may still come: it is not there, or down, or the kernel knows no CAN.
+    """
     _check_kernel(channel)
     found = network_interface(channel)
     if found is None:
-        raise BusError(
+        raise AbsentBusError(
             f"there is no CAN channel {channel!r} ({_channels_found()}); create a virtual one with "
             f"deploy/vcan.sh {channel}, or name another with --can"
         )
     if not found.is_can:
         raise BusError(f"{channel!r} is a network interface, but not a CAN channel")
     if not found.is_up:
-        raise BusError(
+        raise AbsentBusError(
             f"the CAN channel {channel!r} is down; switch it on with: sudo ip link set {channel} up"
         )
     if fd and found.mtu_bytes < _FD_MTU_BYTES:
@@ -169,7 +186,7 @@ def _check_kernel(channel: str) -> None:
         else:
             found = f"this kernel has no SocketCAN: {error.strerror}"
             advice = "load it with: sudo modprobe -a can can_raw vcan"
-        raise BusError(
+        raise AbsentBusError(
             f"cannot open CAN channel {channel!r} ({found}); {advice}, or use another adapter with "
             f"--can-interface ({LOCAL} joins programs on this machine and needs none)"
         ) from error

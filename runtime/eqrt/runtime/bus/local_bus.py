@@ -16,16 +16,20 @@ import socket
 import struct
 import sys
 import time
+from itertools import starmap
 from typing import Any
 
 import can
 
+from eqrt.runtime.bus.ids import Ids
+from eqrt.runtime.bus.kernel_queue import RECEIVE_BYTES, SENDER_BYTES, KernelQueue, enlarge
+
 PORT = 43114
 _HEADER = struct.Struct("<8sIBBxx")  # channel digest, id and its flags, length, CAN FD flags
+_DATAGRAM_BYTES = _HEADER.size + 64
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000  # beside the id, as in SocketCAN
 _BITRATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04  # in the CAN FD flags, as in SocketCAN
 _LOOPBACK = "127.0.0.1"
-_RECEIVE_BYTES = 4 << 20  # asked for; Linux grants 200 kB where nobody has raised the limit
 _IP_MULTICAST_ALL = 49  # Linux: if not cleared, groups that others have joined come in as well
 _SO_TIMESTAMPNS = 35  # Linux: the kernel says when a datagram came, however late it is read
 _TIMESPEC = struct.Struct("@ll")  # s, ns
@@ -67,7 +71,10 @@ class LocalBus(can.BusABC):
         self._sender.setblocking(False)
         self._address = self._sender.getsockname()
         self._receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+        if sys.platform == "linux":
+            enlarge(self._receiver)
+        else:
+            self._receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         with contextlib.suppress(OSError):  # another system than Linux
             self._receiver.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
         if sys.platform == "linux":
@@ -92,21 +99,21 @@ class LocalBus(can.BusABC):
             return None, False
         except OSError as error:
             raise can.CanOperationError(f"cannot receive: {error.strerror}", error.errno) from error
-        if sender == self._address or datagram[:8] != self._digest:
+        is_ours = sender != self._address and datagram[:8] == self._digest
+        if not is_ours or len(datagram) < _HEADER.size:
             return None, False
         message = _unpack(datagram, str(self.channel), arrived_s)
-        is_ours = message is not None and (
-            not message.is_fd or self._can_protocol is can.CanProtocol.CAN_FD
-        )
-        return (message if is_ours else None), False
+        if message.is_fd and self._can_protocol is not can.CanProtocol.CAN_FD:
+            return None, False
+        return message, False
 
     def _read(self) -> tuple[bytes, float, Any]:
         """A datagram, the wall-clock time at which it came, and who sent it."""
         if sys.platform != "linux":
-            datagram, sender = self._receiver.recvfrom(_HEADER.size + 64)
+            datagram, sender = self._receiver.recvfrom(_DATAGRAM_BYTES)
             return datagram, time.time(), sender
         datagram, told, _, sender = self._receiver.recvmsg(
-            _HEADER.size + 64, socket.CMSG_SPACE(_TIMESPEC.size)
+            _DATAGRAM_BYTES, socket.CMSG_SPACE(_TIMESPEC.size)
         )
         for _, kind, stamp in told:
             if kind == _SO_TIMESTAMPNS:
@@ -118,11 +125,91 @@ class LocalBus(can.BusABC):
         """For select: readable when a message may have come."""
         return self._receiver.fileno()
 
+    @property
+    def own_address(self) -> bytes:
+        """Port and address of what this sends, as in struct sockaddr_in."""
+        host, port = self._address
+        return struct.pack("!H4s", port, socket.inet_aton(host))
+
+    def batches(self, receive: Ids | None) -> LocalReader:
+        """What reads many messages at a time, and closes this bus with itself. Linux only.
+
+        `receive`: None = every message; error frames come in any case, unless it is empty.
+        """
+        return LocalReader(self, self._receiver, self._digest, receive)
+
     def shutdown(self) -> None:
         """Leave the bus."""
         super().shutdown()
         self._sender.close()
         self._receiver.close()
+
+
+class LocalReader:
+    """A place on the bus of this machine that is read many messages at a time."""
+
+    def __init__(
+        self, bus: LocalBus, receiver: socket.socket, digest: bytes, receive: Ids | None
+    ) -> None:
+        """See `LocalBus.batches`."""
+        self._bus = bus
+        self._digest = digest
+        self._own = bus.own_address
+        self._is_fd = bus.protocol is can.CanProtocol.CAN_FD
+        self._queue = KernelQueue(receiver, _DATAGRAM_BYTES)
+        self._wanted = None if receive is None else frozenset(starmap(_flagged, receive))
+
+    @property
+    def protocol(self) -> can.CanProtocol:
+        """Whether it carries CAN FD."""
+        return self._bus.protocol
+
+    def fileno(self) -> int:
+        """For select: readable when a message may have come."""
+        return self._bus.fileno()
+
+    def read(self) -> list[can.Message]:
+        """What has come, oldest first, perhaps not all of it; empty if nothing has. Never waits.
+
+        Raises OSError if the bus can no longer be read.
+        """
+        buffer, senders, channel = self._queue.buffer, self._queue.senders, str(self._bus.channel)
+        messages = []
+        for i, (start, length, arrived_s) in enumerate(self._queue.read()):
+            sender = senders[i * SENDER_BYTES + 2 : i * SENDER_BYTES + 8]  # its port and address
+            datagram = buffer[start : start + length]
+            if sender != self._own and datagram[:8] == self._digest and self._wants(datagram):
+                messages.append(_unpack(datagram, channel, arrived_s))
+        return messages
+
+    def _wants(self, datagram: memoryview) -> bool:
+        if len(datagram) < _HEADER.size:
+            return False
+        _, flagged_id, _, flags = _HEADER.unpack_from(datagram)
+        if flags & _FD and not self._is_fd:
+            return False
+        if self._wanted is None or flagged_id in self._wanted:
+            return True
+        return bool(flagged_id & _ERROR and self._wanted)
+
+    def drops(self) -> int:
+        """How many datagrams found the receive queue full, and are lost.
+
+        Among them may be some of other channels whose names lead to the same multicast group.
+        """
+        return self._queue.drops()
+
+    def send(self, msg: can.Message) -> None:
+        """As LocalBus's own."""
+        self._bus.send(msg)
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
+
+def _flagged(arbitration_id: int, is_extended: bool) -> int:
+    return arbitration_id | (_EXTENDED if is_extended else 0)
 
 
 def _group(digest: bytes) -> str:
@@ -145,21 +232,20 @@ def _pack(digest: bytes, message: can.Message) -> bytes:
     return _HEADER.pack(digest, flagged_id, message.dlc, flags) + message.data
 
 
-def _unpack(datagram: bytes, channel: str, arrived_s: float) -> can.Message | None:
-    """The message of a datagram; None if it is not of this format."""
-    if len(datagram) < _HEADER.size:
-        return None
+def _unpack(datagram: bytes | memoryview, channel: str, arrived_s: float) -> can.Message:
+    """The message of a datagram of this format."""
     _, flagged_id, length, flags = _HEADER.unpack_from(datagram)
-    return can.Message(
-        timestamp=arrived_s,
-        channel=channel,
-        arbitration_id=flagged_id & 0x1FFFFFFF,
-        is_extended_id=bool(flagged_id & _EXTENDED),
-        is_remote_frame=bool(flagged_id & _REMOTE),
-        is_error_frame=bool(flagged_id & _ERROR),
-        is_fd=bool(flags & _FD),
-        bitrate_switch=bool(flags & _BITRATE_SWITCH),
-        error_state_indicator=bool(flags & _ERROR_STATE),
-        dlc=length if flagged_id & _REMOTE else None,  # else as many as have come
-        data=datagram[_HEADER.size :],
+    return can.Message(  # by position, which is twice as fast; see the signature there
+        arrived_s,
+        flagged_id & 0x1FFFFFFF,
+        bool(flagged_id & _EXTENDED),
+        bool(flagged_id & _REMOTE),
+        bool(flagged_id & _ERROR),
+        channel,
+        length if flagged_id & _REMOTE else None,  # else as many as have come
+        datagram[_HEADER.size :],
+        bool(flags & _FD),
+        True,
+        bool(flags & _BITRATE_SWITCH),
+        bool(flags & _ERROR_STATE),
     )

@@ -22,20 +22,25 @@ from eqrt.runtime.decoding.dbc_tables import Payload
 from eqrt.runtime.decoding.decoder_counters import DecoderCounters
 from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
 from eqrt.runtime.decoding.ego_messages import EgoDecoder
+from eqrt.runtime.decoding.ego_profile import EgoProfile
 from eqrt.runtime.decoding.geodesy import MapOrigin
+from eqrt.runtime.decoding.message_check import MessageCheck, message_check
 from eqrt.runtime.decoding.objects import ObjectDecoder
 from eqrt.runtime.decoding.profile import Profile
 from eqrt.runtime.decoding.sensor_profile import SensorProfile
+from eqrt.runtime.protection.sequence import Status
+from eqrt.runtime.protection.source_health import SourceHealth, SourceReport
 
 if TYPE_CHECKING:
     import can
 
 Event = Detections | EgoMotion | EgoPose
-Take = Callable[[Payload, float], Sequence[Event]]
-"""(data, timestamp in seconds) -> what that completes."""
+Take = Callable[[Payload, float, Status], Sequence[Event]]
+"""(data, timestamp in seconds, how it came) -> what that completes."""
 
 _NOTHING: list[Event] = []  # shared by every message that completes nothing; never appended to
-_UNREADABLE = b""  # stands for a message that came, but damaged
+_OK = Status.OK  # a member's name is looked up slowly, and every message needs it
+_UNREADABLE = b""  # stands for a message that came, but damaged or not new
 
 
 class Decoder:
@@ -60,14 +65,22 @@ class Decoder:
         self._sensors = [_SensorInput(sensor, self.counters) for sensor in profile.sensors]
         self._routes: dict[int, list[_Route]] = {}
         accepted = _accepted_channels(profile, channels)
-        for sensor in self._sensors:
-            for address, take in sensor.inputs():
-                self._add_route(address, accepted[sensor.profile.bus], take)
         origin = _map_origin(map_origin_deg)
-        self._egos = [EgoDecoder(ego, origin) for ego in profile.ego]
-        for ego, decoder in zip(profile.ego, self._egos, strict=True):
-            for i, part in enumerate(ego.parts):
-                self._add_route(part.address, accepted[ego.bus], partial(decoder.add, i))
+        self._egos = [_EgoInput(ego, origin, self.counters) for ego in profile.ego]
+        self._sources: list[_SensorInput | _EgoInput] = [*self._sensors, *self._egos]
+        for source in self._sources:
+            for address, take in source.inputs():
+                check = message_check(address, self.counters, source.profile.silence_s)
+                route = _Route(address, accepted[source.profile.bus], take, check, self.counters)
+                self._routes.setdefault(address.arbitration_id, []).append(route)
+
+    @property
+    def sources(self) -> tuple[SourceReport, ...]:
+        """How the sensors of the profile are, then what tells about the ego vehicle.
+
+        As of the last `feed` or `poll`: silence shows only when time passes.
+        """
+        return tuple(source.health.report for source in self._sources)
 
     def set_map_origin(self, map_origin_deg: tuple[float, float] | None) -> bool:
         """Count latitudes and longitudes from another origin, see `__init__`; True if there are."""
@@ -75,10 +88,6 @@ class Decoder:
         for ego in geodetic:
             ego.set_origin(_map_origin(map_origin_deg))
         return bool(geodetic)
-
-    def _add_route(self, address: Address, channels: _Channels, take: Take) -> None:
-        route = _Route(address, channels, take, self.counters)
-        self._routes.setdefault(address.arbitration_id, []).append(route)
 
     def feed(self, message: can.Message, timestamp_s: float) -> list[Event]:
         """What this message completes; mostly nothing. The list is not to be changed."""
@@ -108,6 +117,8 @@ class Decoder:
         for sensor in self._sensors:
             if told := sensor.expire(now_s):
                 events = [*events, *told]
+        for ego in self._egos:
+            ego.health.expire(now_s)
         return events
 
 
@@ -119,13 +130,18 @@ class _Route:
     """From a message on the bus to what takes its data."""
 
     def __init__(
-        self, address: Address, channels: _Channels, take: Take, counters: DecoderCounters
+        self,
+        address: Address,
+        channels: _Channels,
+        take: Take,
+        check: MessageCheck | None,
+        counters: DecoderCounters,
     ) -> None:
         self.address = address
         self.channels = channels
         self._is_extended = address.is_extended
         self._needed_bytes = address.needed_bytes
-        self._checksum = address.checksum
+        self._check = check
         self._take = take
         self._counters = counters
 
@@ -140,12 +156,12 @@ class _Route:
     def take(self, data: Payload, timestamp_s: float) -> Sequence[Event]:
         if len(data) < self._needed_bytes:
             self._counters.short += 1
-        if self._checksum is not None and not self._checksum.holds(
-            self.address.arbitration_id, data
-        ):
-            self._counters.bad_checksum += 1
+        if self._check is None:
+            return self._take(data, timestamp_s, _OK)
+        status = self._check.status(data, timestamp_s)
+        if status is not _OK and not status.is_usable:
             data = _UNREADABLE
-        return self._take(data, timestamp_s)
+        return self._take(data, timestamp_s, status)
 
 
 class _SensorInput:
@@ -156,6 +172,7 @@ class _SensorInput:
         self._framing = framing_of(profile, counters)
         self._objects = ObjectDecoder(profile, counters)
         self._counters = counters
+        self.health = SourceHealth(profile.name, profile.silence_s)
 
     def inputs(self) -> Iterator[tuple[Address, Take]]:
         """Which messages it takes, and what takes each."""
@@ -166,22 +183,84 @@ class _SensorInput:
                 yield address, partial(self._add, i, slot)
 
     def expire(self, now_s: float) -> Sequence[Event]:
-        return self._decoded(self._framing.expire(now_s))
+        events = self._decoded(self._framing.expire(now_s))
+        self.health.expire(now_s)
+        return events
 
-    def _open(self, data: Payload, timestamp_s: float) -> Sequence[Event]:
-        return self._decoded(self._framing.open(data, timestamp_s))
+    def _open(self, data: Payload, timestamp_s: float, status: Status) -> Sequence[Event]:
+        if status is _OK:
+            cycles = self._framing.open(data, timestamp_s, status)
+            return self._decoded(cycles) if cycles else ()
+        return self._open_wrong(data, timestamp_s, status)
 
-    def _add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> Sequence[Event]:
-        return self._decoded(self._framing.add(part, slot, data, timestamp_s))
+    def _open_wrong(self, data: Payload, timestamp_s: float, status: Status) -> Sequence[Event]:
+        if status.is_stale and self._framing.blame_header():
+            return ()
+        cycles = () if status.is_stale else self._framing.open(data, timestamp_s, status)
+        events = self._decoded(cycles)
+        if not status.is_usable and not self._framing.is_open:
+            # The cycle that does not begin is the wrong one; the next one need not follow it.
+            self.health.judge(False, timestamp_s)
+            self._objects.forget_counter()
+        return events
+
+    def _add(
+        self, part: int, slot: int, data: Payload, timestamp_s: float, status: Status
+    ) -> Sequence[Event]:
+        cycles = self._framing.add(part, slot, data, timestamp_s, status)
+        return self._decoded(cycles) if cycles else ()
 
     def _decoded(self, cycles: tuple[Cycle, ...]) -> Sequence[Event]:
-        if not cycles:
-            return ()
-        detections = [self._objects.decode(cycle) for cycle in cycles]
-        self._counters.cycles += len(cycles)
-        self._counters.incomplete_cycles += sum(not cycle.complete for cycle in cycles)
-        self._counters.objects += sum(len(one.object_id) for one in detections)
+        return [used for cycle in cycles if (used := self._detections(cycle)) is not None]
+
+    def _detections(self, cycle: Cycle) -> Detections | None:
+        """What the cycle holds; None if the sensor is not to be believed."""
+        if self.health.expire(cycle.first_s):
+            self._objects.forget_counter()
+        detections = self._objects.decode(cycle)
+        self._counters.cycles += 1
+        self._counters.incomplete_cycles += not cycle.complete
+        if not self.health.judge(self._objects.is_right(cycle), cycle.last_s):
+            self.health.refuse()
+            self._counters.refused_cycles += 1
+            return None
+        self._counters.objects += len(detections.object_id)
         return detections
+
+
+class _EgoInput:
+    """One `[[ego]]`: its messages to motion and poses."""
+
+    def __init__(
+        self, profile: EgoProfile, origin: MapOrigin | None, counters: DecoderCounters
+    ) -> None:
+        self.profile = profile
+        self._decoder = EgoDecoder(profile, origin)
+        self._counters = counters
+        self.health = SourceHealth(profile.name, profile.silence_s, len(profile.parts))
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether it tells poses by latitude and longitude."""
+        return self._decoder.is_geodetic
+
+    def set_origin(self, origin: MapOrigin | None) -> None:
+        """The map has another origin from now on."""
+        self._decoder.set_origin(origin)
+
+    def inputs(self) -> Iterator[tuple[Address, Take]]:
+        """Which messages it takes, and what takes each."""
+        for i, part in enumerate(self.profile.parts):
+            yield part.address, partial(self._add, i)
+
+    def _add(self, part: int, data: Payload, timestamp_s: float, status: Status) -> Sequence[Event]:
+        events = self._decoder.add(part, data, timestamp_s)
+        valid = self.health.judge(status is _OK, timestamp_s, part)
+        if valid or not events:
+            return events
+        self.health.refuse()
+        self._counters.refused_ego += 1
+        return ()
 
 
 _Channels = frozenset[str | int | None] | None

@@ -5,17 +5,31 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import reduce
+from typing import Literal, Protocol
+
+from eqrt.runtime.protection.e2e import Profile5
+
+
+class Check(Protocol):
+    """What a message must carry to be as it was sent."""
+
+    def holds(self, arbitration_id: int, data: bytes | bytearray) -> bool:
+        """Whether the message carries the checksum of the rest of itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Checksum:
-    """Which byte of a message holds a checksum, and over what."""
+    """Which bytes of a message hold a checksum, and over what."""
 
     combine: Callable[[bytes], int]
-    """Bytes -> 0..255."""
+    """Bytes -> 0..255, or 0..65535 for a checksum of two bytes."""
     byte: int
     """Index of the checksum in the payload; negative counts from its end."""
+    size: int = 1
+    """Bytes of the checksum."""
+    order: Literal["little", "big"] = "little"
+    """Of these bytes."""
     covers_id: bool
     """The arbitration id's bytes, high first, go in before the data."""
     covers_length: bool
@@ -24,12 +38,27 @@ class Checksum:
     def holds(self, arbitration_id: int, data: bytes | bytearray) -> bool:
         """Whether the message carries the checksum of the rest of itself."""
         place = self.byte if self.byte >= 0 else len(data) + self.byte
-        if not 0 <= place < len(data):
+        end = place + self.size
+        if place < 0 or end > len(data):
             return False
         before = _big_endian(arbitration_id) if self.covers_id else b""
         if self.covers_length:
             before += bytes((len(data),))
-        return self.combine(b"".join((before, data[:place], data[place + 1 :]))) == data[place]
+        stored = data[place] if self.size == 1 else int.from_bytes(data[place:end], self.order)
+        return self.combine(b"".join((before, data[:place], data[end:]))) == stored
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class E2eCheck:
+    """AUTOSAR E2E profile 5 over the bytes that the DBC gives the message."""
+
+    profile: Profile5
+    length: int
+    """Bytes of the message; what a longer one has behind them is not covered, nor read."""
+
+    def holds(self, arbitration_id: int, data: bytes | bytearray) -> bool:  # noqa: ARG002  # the data id stands for it
+        """Whether the message carries the check of the rest of itself and of its data id."""
+        return len(data) >= self.length and self.profile.counter(data[: self.length]) is not None
 
 
 def sum8(data: bytes) -> int:
@@ -40,30 +69,6 @@ def sum8(data: bytes) -> int:
 def xor8(data: bytes) -> int:
     """All bytes, exclusive or."""
     return reduce(operator.xor, data, 0)
-
-
-def crc8(polynomial: int, start: int, final_xor: int) -> Callable[[bytes], int]:
-    """The cyclic redundancy check of eight bits, most significant bit first."""
-    table = _crc8_table(polynomial)
-
-    def combine(data: bytes) -> int:
-        crc = start
-        for byte in data:
-            crc = table[crc ^ byte]
-        return crc ^ final_xor
-
-    return combine
-
-
-@cache
-def _crc8_table(polynomial: int) -> bytes:
-    table = bytearray()
-    for crc in range(256):
-        for _ in range(8):
-            crc = (crc << 1) ^ (polynomial if crc & 0x80 else 0)  # noqa: PLW2901  # shifted out
-            crc &= 0xFF  # noqa: PLW2901
-        table.append(crc)
-    return bytes(table)
 
 
 def _big_endian(arbitration_id: int) -> bytes:

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from eqrt.runtime.decoding.dbc_tables import Payload
 from eqrt.runtime.decoding.decoder_counters import DecoderCounters
 from eqrt.runtime.decoding.sensor_profile import Part, SensorProfile
+from eqrt.runtime.protection.sequence import Status
 
+_OK = Status.OK  # a member's name is looked up slowly, and every message needs it
 _PATIENCE = 3
 """Cycles without any message of an optional part, after which it is not waited for any more."""
 
@@ -31,6 +33,17 @@ class Cycle:
     """Arrival of the first message."""
     last_s: float
     complete: bool
+    header_right: bool = True
+    """The header was neither damaged nor the first one after lost ones; True without a header."""
+    num_messages: int = 0
+    """Messages of objects that came."""
+    num_wrong: int = 0
+    """Of those: damaged, out of sequence, or the first one after lost ones."""
+
+    def is_right(self, num_foreign: int = 0) -> bool:
+        """Whether header and most messages are; `num_foreign` more turned out to be wrong."""
+        wrong = self.num_wrong + num_foreign
+        return self.header_right and (not wrong or 2 * wrong < self.num_messages)
 
 
 def framing_of(sensor: SensorProfile, counters: DecoderCounters) -> Framing:
@@ -52,10 +65,22 @@ class Framing(ABC):
         self._is_open = False
 
     @abstractmethod
-    def add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:
-        """Take a message of an object; `slot` counts from 0."""
+    def add(
+        self, part: int, slot: int, data: Payload, timestamp_s: float, status: Status
+    ) -> tuple[Cycle, ...]:
+        """Take a message of an object; `slot` counts from 0. What is not usable has no data."""
 
-    def open(self, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:
+    @property
+    def is_open(self) -> bool:
+        """Whether more messages are awaited."""
+        return self._is_open
+
+    def blame_header(self) -> bool:
+        """The header of the open cycle came again; False = no cycle is open."""
+        self._header_right = False
+        return self._is_open
+
+    def open(self, data: Payload, timestamp_s: float, status: Status) -> tuple[Cycle, ...]:
         """Take a header: it ends the cycle before, and begins one if its count can be read."""
         closed = self._close(complete=False)
         header, count = self._sensor.header, None
@@ -66,6 +91,7 @@ class Framing(ABC):
                 return closed
             count = int(number)
         self._begin(data, count, timestamp_s)
+        self._header_right = status is _OK
         return closed if self._missing else closed + self._close(complete=True)
 
     def expire(self, now_s: float) -> tuple[Cycle, ...]:
@@ -91,7 +117,8 @@ class Framing(ABC):
         return -(-self._count // self._sensor.objects_per_message)
 
     def _begin(self, header: Payload | None, count: int | None, timestamp_s: float) -> None:
-        self._is_open = True
+        self._is_open = self._header_right = True
+        self._num_wrong = self._num_stale = 0
         self._header, self._count = header, count
         self._first_s = self._last_s = timestamp_s
         self._payloads = [self._blank() for _ in self._sensor.parts]
@@ -106,7 +133,8 @@ class Framing(ABC):
         if not self._is_open:
             return ()
         self._is_open = False
-        self._learn()
+        came = [sum(data is not None for data in part) for part in self._payloads]
+        self._learn(came)
         cycle = Cycle(
             payloads=[[data or b"" for data in part] for part in self._payloads],
             header=self._header,
@@ -114,12 +142,14 @@ class Framing(ABC):
             first_s=self._first_s,
             last_s=self._last_s,
             complete=complete,
+            header_right=self._header_right,
+            num_messages=sum(came) + self._num_stale,
+            num_wrong=self._num_wrong,
         )
         return (cycle,)
 
-    def _learn(self) -> None:
+    def _learn(self, came: Sequence[int]) -> None:
         """Which optional messages this sensor sends at all: some are sent only if configured."""
-        came = [sum(data is not None for data in part) for part in self._payloads]
         if not came[0] or came[0] < self._most[0]:
             return  # empty, or cut off: tells nothing
         for i, part in enumerate(self._sensor.parts):
@@ -136,17 +166,35 @@ class Framing(ABC):
 class CountedFraming(Framing):
     """A header with the number of objects, then their messages, part after part or mixed."""
 
-    def add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:  # noqa: ARG002  # there are no slots
+    def add(
+        self,
+        part: int,
+        slot: int,  # noqa: ARG002  # there are no slots
+        data: Payload,
+        timestamp_s: float,
+        status: Status,
+    ) -> tuple[Cycle, ...]:
         """Take a message of an object."""
         late = self.expire(timestamp_s)
+        if status is not _OK and self._is_stale(status):
+            return late
         if not self._is_open or len(self._payloads[part]) >= self._most[part]:
             self._stray(part)
             return late
+        self._num_wrong += status is not _OK
         self._payloads[part].append(data)
         self._last_s = timestamp_s
         if self._awaited[part]:
             self._missing -= 1
         return late if self._missing else late + self._close(complete=True)
+
+    def _is_stale(self, status: Status) -> bool:
+        """Whether a message stands for no object of the cycle, because it is not new."""
+        if not status.is_stale:
+            return False
+        self._num_wrong += 1
+        self._num_stale += 1
+        return True
 
     def _needed(self, part: Part) -> int:
         return part.per_cycle if part.per_cycle is not None else self._num_messages or 0
@@ -161,9 +209,15 @@ class SlotFraming(Framing):
     With a header, only a header begins a cycle. `single` framing is that of one slot.
     """
 
-    def add(self, part: int, slot: int, data: Payload, timestamp_s: float) -> tuple[Cycle, ...]:
+    def add(
+        self, part: int, slot: int, data: Payload, timestamp_s: float, status: Status
+    ) -> tuple[Cycle, ...]:
         """Take a message of a slot."""
         closed = self.expire(timestamp_s)
+        if status is not _OK and self._is_repeat(part, slot, status):
+            self._num_wrong += 1
+            self._num_stale += 1
+            return closed
         if self._is_open and self._payloads[part][slot] is not None:
             closed += self._close(complete=False)
         if not self._is_open:
@@ -173,9 +227,14 @@ class SlotFraming(Framing):
             self._begin(None, None, timestamp_s)
         self._payloads[part][slot] = data
         self._last_s = timestamp_s
+        self._num_wrong += status is not _OK
         if slot < self._awaited[part]:
             self._missing -= 1
         return closed if self._missing else closed + self._close(complete=True)
+
+    def _is_repeat(self, part: int, slot: int, status: Status) -> bool:
+        """Whether the slot's message of the open cycle has come before."""
+        return status.is_stale and self._is_open and self._payloads[part][slot] is not None
 
     def _needed(self, part: Part) -> int:  # noqa: ARG002  # all parts have the same slots
         slots = len(self._sensor.slots)

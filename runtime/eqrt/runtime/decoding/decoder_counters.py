@@ -26,11 +26,16 @@ class DecoderCounters:
     bad_checksum: int = 0
     """Of the used: damaged, nothing in them counts."""
     bad_counter: int = 0
-    """Messages of another cycle, and cycles whose counter did not follow the last one's."""
+    """Messages of another cycle or out of sequence, and cycles whose counter did not follow the
+    last one's."""
     cycles: int = 0
     incomplete_cycles: int = 0
     """Of the cycles: closed by a timeout or by the next one."""
+    refused_cycles: int = 0
+    """Of the cycles: not used, because their sensor was not valid."""
+    refused_ego: int = 0
+    """What messages told about the ego vehicle and was not used, for the same reason."""
     objects: int = 0
-    """Valid ones, in all cycles."""
+    """Valid ones, in all cycles that were used."""
     invalid_objects: int = 0
     """Left out; of radars with slots, mostly slots that say that they are empty."""

@@ -12,6 +12,7 @@ from eqrt.runtime.decoding.dbc_files import Dbc, DbcMessage
 from eqrt.runtime.decoding.dbc_tables import Column, SignalTable
 from eqrt.runtime.decoding.profile_schema import EgoMessageTable, EgoTable
 from eqrt.runtime.decoding.sensor_checks import MAX_TIME_S
+from eqrt.runtime.protection.source_health import DEFAULT_SILENCE_S
 
 _MEASURES = {
     "speed": "speed",
@@ -39,6 +40,8 @@ class EgoPart:
 class EgoProfile:
     """Some messages that tell the ego vehicle's motion or pose together."""
 
+    name: str
+    """`ego` and the message that tells."""
     bus: str
     """The role of the bus that they are on."""
     parts: tuple[EgoPart, ...]
@@ -51,6 +54,8 @@ class EgoProfile:
     valid: BoundCondition | None
     latency_s: float
     hold_s: float
+    silence_s: float
+    """After so long without the last message it is not valid."""
 
 
 def bind_ego(table: EgoTable, dbc: Dbc, id_offset: int, where: str) -> EgoProfile:
@@ -74,10 +79,17 @@ def bind_ego(table: EgoTable, dbc: Dbc, id_offset: int, where: str) -> EgoProfil
     valid = fields.valid and binder.condition("fields.valid", fields.valid)
     id_offset += table.arbitration_id_offset
     parts = [
-        _part(messages[name], spec, binder.columns(i), id_offset, f"{where}.messages.{name}")
+        _part(
+            messages[name],
+            spec,
+            binder.columns(i),
+            id_offset=id_offset,
+            where=f"{where}.messages.{name}",
+        )
         for i, (name, spec) in enumerate(specs.items())
     ]
     return EgoProfile(
+        name=f"ego {list(messages.values())[-1].name}",
         bus=table.bus,
         parts=tuple(parts),
         numbers=numbers,
@@ -85,15 +97,25 @@ def bind_ego(table: EgoTable, dbc: Dbc, id_offset: int, where: str) -> EgoProfil
         valid=valid or None,
         latency_s=table.latency_s,
         hold_s=table.hold_s,
+        silence_s=DEFAULT_SILENCE_S if table.silence_s is None else table.silence_s,
     )
 
 
 def _part(
-    message: DbcMessage, spec: EgoMessageTable, columns: list[Column], id_offset: int, where: str
+    message: DbcMessage,
+    spec: EgoMessageTable,
+    columns: list[Column],
+    *,
+    id_offset: int,
+    where: str,
 ) -> EgoPart:
+    counter = None
+    if spec.counter is not None:
+        counter = Binder(where, {"": [message]}).signal("counter", spec.counter)
     address = address_of(
         message,
         spec.checksum,
+        counter=counter,
         id_offset=id_offset,
         needed_bytes=SignalTable(columns).needed_bytes,
         where=where,
@@ -119,5 +141,7 @@ def _check(table: EgoTable, where: str) -> None:
         problem = f"latency_s is {table.latency_s}, expected 0 to {MAX_TIME_S:g}"
     elif not 0.0 < table.hold_s <= MAX_TIME_S:
         problem = f"hold_s is {table.hold_s}, expected above 0 to {MAX_TIME_S:g}"
+    elif table.silence_s is not None and not 0.0 < table.silence_s <= MAX_TIME_S:
+        problem = f"silence_s is {table.silence_s}, expected above 0 to {MAX_TIME_S:g}"
     if problem:
         raise ProfileError(f"{where}: {problem}")

@@ -1,7 +1,8 @@
 """The writer of eqrt's generic object list, whose messages dbc/eqrt_objects.dbc defines.
 
 Makes recordings, demonstrations and tests; a stack that feeds eqrt does the same on its side.
-Every message is classic CAN of eight bytes, all signals little-endian.
+Every message is classic CAN of eight bytes, all signals little-endian; with end-to-end protection
+it is CAN FD of twelve (dbc/eqrt_objects_e2e.dbc, profile `generic-e2e`).
 """
 
 from __future__ import annotations
@@ -18,13 +19,17 @@ from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.dbc_files import DbcMessage, load_dbc
 from eqrt.runtime.decoding.dbc_tables import Signal
 from eqrt.runtime.decoding.detections import Detections, VelocityKind
+from eqrt.runtime.protection.e2e import Profile5, Sender, data_id_of
 
 INTERFACE_VERSION = 1
 MAX_OBJECTS = 255
 MAX_OBJECT_ID = 255
+PROTECTED_ID_OFFSET = 8
+"""From a message's id to that of the protected one: both lists may be on one bus."""
 
 _DBC = Path(__file__).parent / "dbc" / "eqrt_objects.dbc"
 _LENGTH = 8  # bytes of every message
+_HEADER_BYTES = 4  # before them, in protected ones
 _NOT_AVAILABLE = {  # signals that have such a value; see `_not_available` for which it is
     "EGO_MOTION": ("SPEED", "YAW_RATE"),
     "OBJECT_POSITION": ("EXISTENCE",),
@@ -45,6 +50,7 @@ def encode_cycle(
     message_s: float = 0.0,
     channel: str | int | None = None,
     arbitration_id_offset: int = 0,
+    protection: ListProtection | None = None,
 ) -> list[can.Message]:
     """The messages of one cycle, in the order in which they go on the bus.
 
@@ -52,7 +58,8 @@ def encode_cycle(
     fit a signal's range takes its nearest value, and objects without a position are left out.
     `counter` counts cycles, modulo 256. All of it was measured `age_s` before the first message;
     each message goes `message_s` after the one before, as its stamp and its age say. None leaves a
-    message out. Raises ValueError for more than 255 objects, another id or kind of velocity.
+    message out. `protection` counts from cycle to cycle; None = without it. Raises ValueError for
+    more than 255 objects, another id or kind of velocity.
     """
     blocks: list[tuple[str, NDArray[np.uint8]]] = []
 
@@ -73,17 +80,41 @@ def encode_cycle(
         add("EGO_YAW", YAW=yaw, QUALITY=_GOOD, AGE=age_ms(), COUNTER=counter % 256)
     if objects is not None:
         blocks += _object_blocks(objects, counter % 256, age_ms())
-    payloads = [(name, data) for name, block in blocks for data in block]
-    return [
+    messages = [
         can.Message(
-            timestamp=timestamp_s + place * message_s,
             arbitration_id=_messages()[name].arbitration_id + arbitration_id_offset,
             is_extended_id=False,
             channel=channel,
             data=data.tobytes(),
         )
-        for place, (name, data) in enumerate(payloads)
+        for name, block in blocks
+        for data in block
     ]
+    for place, message in enumerate(messages):
+        message.timestamp = timestamp_s + place * message_s
+    return messages if protection is None else [protection.protect(one) for one in messages]
+
+
+class ListProtection:
+    """Makes protected messages of the object list's plain ones, and counts them by id."""
+
+    def __init__(self) -> None:
+        self._senders: dict[int, Sender] = {}
+
+    def protect(self, message: can.Message) -> can.Message:
+        """The message as CAN FD: a header of E2E profile 5, a byte 0, the eight bytes it had."""
+        arbitration_id = message.arbitration_id + PROTECTED_ID_OFFSET
+        if arbitration_id not in self._senders:
+            self._senders[arbitration_id] = Sender(Profile5(data_id=data_id_of(arbitration_id)))
+        return can.Message(
+            timestamp=message.timestamp,
+            arbitration_id=arbitration_id,
+            is_extended_id=message.is_extended_id,
+            is_fd=True,
+            bitrate_switch=True,
+            channel=message.channel,
+            data=self._senders[arbitration_id].protect(bytes(_HEADER_BYTES) + message.data),
+        )
 
 
 def _object_blocks(

@@ -31,14 +31,29 @@ class ObjectDecoder:
         self._sensor = sensor
         self._fields = sensor.fields
         self._last_counter = _NAN
+        self._has_counter = False
+        self._follows = True
+        self._num_foreign = 0
         packed = np.arange(sensor.objects_per_message)
         slots = np.array(sensor.slots, np.float64)
         self._slot_ids = (slots[:, None] * len(packed) + packed).ravel()
 
     def decode(self, cycle: Cycle) -> Detections:
         """The valid objects of a cycle."""
+        self._follows, self._has_counter, self._num_foreign = True, False, 0
         with np.errstate(all="ignore"):  # a sensor may send numbers that no arithmetic survives
-            return self._decode(cycle)
+            detections = self._decode(cycle)
+        if not self._has_counter and cycle.num_wrong:
+            self.forget_counter()
+        return detections
+
+    def is_right(self, cycle: Cycle) -> bool:
+        """Whether the cycle decoded last is: its counter follows, most messages belong to it."""
+        return self._follows and cycle.is_right(self._num_foreign)
+
+    def forget_counter(self) -> None:
+        """Any counter may come next: the last one could not be read, or is long ago."""
+        self._last_counter = _NAN
 
     def _decode(self, cycle: Cycle) -> Detections:
         counter, age_s = self._header(cycle.header)
@@ -106,10 +121,11 @@ class ObjectDecoder:
         return counter, age_s if age_s > 0.0 else 0.0
 
     def _check_step(self, counter: float, modulus: int, steps: Sequence[int]) -> None:
-        last, self._last_counter = self._last_counter, counter
+        last, self._last_counter, self._has_counter = self._last_counter, counter, True
         expected = [(last + step) % modulus for step in steps]
         if not math.isnan(last) and counter not in expected:
             self._counters.bad_counter += 1
+            self._follows = False
 
     def _values(self, cycle: Cycle, counter: float) -> list[Float64]:
         """By part, (S, D)."""
@@ -140,6 +156,7 @@ class ObjectDecoder:
             other = (seen != counter % part.counter.modulus) & ~np.isnan(seen)
             if other.any():
                 self._counters.bad_counter += int(other.sum())
+                self._num_foreign += int(other.sum()) // packed
                 values[:, other] = _NAN
         return values
 

@@ -43,11 +43,16 @@ class Profile:
     @property
     def arbitration_ids(self) -> frozenset[int]:
         """Every id that the profile means, on any bus."""
+        return frozenset(arbitration_id for arbitration_id, _ in self.ids)
+
+    @property
+    def ids(self) -> frozenset[tuple[int, bool]]:
+        """The same, and whether each is an extended one."""
         addresses = [part.address for ego in self.ego for part in ego.parts]
         for sensor in self.sensors:
             addresses += [address for part in sensor.parts for address in part.addresses]
             addresses += [sensor.header.address] if sensor.header else []
-        return frozenset(address.arbitration_id for address in addresses)
+        return frozenset((address.arbitration_id, address.is_extended) for address in addresses)
 
     @property
     def roles(self) -> tuple[str, ...]:

@@ -57,15 +57,18 @@ class MeanTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChecksumTable:
-    """A checksum in one byte of a message."""
+    """A checksum in a message; which keys go with which kind is checked in `checksum_binding`."""
 
-    kind: Literal["sum8", "xor8", "crc8"]
-    byte: int = -1
+    kind: Literal["sum8", "xor8", "crc8", "crc16", "e2e-p5"]
+    byte: int | None = None
+    order: Literal["little", "big"] = "little"
     covers_id: bool = False
     covers_length: bool = False
-    polynomial: int = 0x1D
-    start: int = 0xFF
-    final_xor: int = 0xFF
+    polynomial: int | None = None
+    start: int | None = None
+    final_xor: int | None = None
+    data_id: int | None = None
+    offset: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,6 +144,7 @@ class SensorTable:
     fields: ObjectFieldsTable
     velocity: Literal["none", "relative", "absolute", "radial"] = "none"
     timeout_s: float = 0.05
+    silence_s: float | None = None
     latency_s: float = 0.0
     arbitration_id_offset: int = 0
     object_id_offset: int = 0
@@ -155,6 +159,7 @@ class EgoMessageTable:
     """One of the messages that tell the ego vehicle's motion; a plain string is its name."""
 
     message: str
+    counter: str | None = None
     checksum: ChecksumTable | None = None
 
 
@@ -185,6 +190,7 @@ class EgoTable:
     fields: EgoFieldsTable
     latency_s: float = 0.0
     hold_s: float = 0.05
+    silence_s: float | None = None
     arbitration_id_offset: int = 0
 
 

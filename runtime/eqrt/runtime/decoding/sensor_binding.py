@@ -19,7 +19,7 @@ from eqrt.runtime.decoding.profile_schema import (
     PartTable,
     SensorTable,
 )
-from eqrt.runtime.decoding.sensor_checks import SLOT_ID, check_sensor
+from eqrt.runtime.decoding.sensor_checks import SLOT_ID, check_sensor, silence_of
 from eqrt.runtime.decoding.sensor_profile import (
     Counter,
     Header,
@@ -86,6 +86,7 @@ class _Sensor:
             fields=fields,
             velocity_kind=VelocityKind[table.velocity.upper()],
             timeout_s=table.timeout_s,
+            silence_s=silence_of(table),
             latency_s=table.latency_s,
             object_id_offset=table.object_id_offset,
             mount=Pose2(mount.x_m, mount.y_m, math.radians(mount.yaw_deg)),
@@ -169,6 +170,7 @@ class _Sensor:
     def _part(self, index: int, object_id: Reference | None, counter: Counter | None) -> Part:
         name, part = list(self.parts.items())[index]
         signals = SignalTable(self.binder.columns(index))
+        self._check_data_id(name, part)
         addresses = [
             address_of(
                 message,
@@ -186,6 +188,14 @@ class _Sensor:
             counter=counter,
             per_cycle=part.per_cycle,
             optional=part.optional,
+        )
+
+    def _check_data_id(self, name: str, part: PartTable) -> None:
+        if part.checksum is None or part.checksum.data_id is None or len(self.slots) == 1:
+            return
+        raise ProfileError(
+            f"{self.where}.messages.{name}.checksum: data_id is that of one message, and this has "
+            f"{len(self.slots)} slots; without the key, each has the low 16 bits of its own id"
         )
 
     def _header(self) -> Header | None:

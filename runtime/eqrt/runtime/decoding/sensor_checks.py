@@ -6,6 +6,7 @@ import math
 
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.decoding.profile_schema import PartTable, SensorTable
+from eqrt.runtime.protection.source_health import DEFAULT_SILENCE_S
 
 SLOT_ID = "slot"
 """The `id` of objects that are known by their slot."""
@@ -74,8 +75,20 @@ def _velocity(table: SensorTable) -> list[str]:
     return [f'velocity = "{kind}" goes with {need}']
 
 
+def silence_of(table: SensorTable) -> float:
+    """Time without a cycle that means that the sensor is silent."""
+    if table.silence_s is not None:
+        return table.silence_s
+    return max(DEFAULT_SILENCE_S, 2.0 * table.timeout_s)
+
+
 def _numbers(table: SensorTable) -> list[str]:
     problems = []
+    if table.silence_s is not None and not table.timeout_s < table.silence_s <= MAX_TIME_S:
+        problems.append(
+            f"silence_s is {table.silence_s}, expected above timeout_s ({table.timeout_s:g}) to "
+            f"{MAX_TIME_S:g}"
+        )
     if not 0.0 < table.timeout_s <= MAX_TIME_S:
         problems.append(f"timeout_s is {table.timeout_s}, expected above 0 to {MAX_TIME_S:g}")
     if not 0.0 <= table.latency_s <= MAX_TIME_S:

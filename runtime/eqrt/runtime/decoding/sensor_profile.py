@@ -97,6 +97,8 @@ class SensorProfile:
     velocity_kind: VelocityKind
     timeout_s: float
     """A cycle that is not complete by then is closed as it is."""
+    silence_s: float
+    """After so long without a cycle it is not valid."""
     latency_s: float
     """From the measurement to the first message on the bus."""
     object_id_offset: int

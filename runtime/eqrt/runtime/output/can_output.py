@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from eqrt.core.frames import wrap_angle
 from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.protection.e2e import crc_p2_rows, crc_p5_rows, data_id_of, data_ids_of
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MAX_OBJECTS = 255
 """More targets than this are not sent: the first ones are."""
 FD_POINTS = 10
@@ -39,8 +40,9 @@ class Offset(IntEnum):
     POINT_CLASSIC = 5
 
 
-# The fields of a message in their order on the wire, without gaps. `alive` is left to whoever
-# sends; in the classic messages it is the low half of its byte, and the high half is used as well.
+# The fields of a message in their order on the wire, without gaps. `alive` and `crc` are for
+# `protect`, last of all; in the classic messages `alive` is the low half of its byte, and the high
+# half is used as well.
 STATUS = np.dtype(
     [
         ("crc", "<u2"),
@@ -133,6 +135,22 @@ def encode_classic(forecasts: ForecastSet) -> list[tuple[Offset, Rows]]:
         (Offset.OBJECT_CLASSIC, _objects_classic(forecasts)),
         (Offset.POINT_CLASSIC, _points_classic(forecasts)),
     ]
+
+
+def protect(rows: Rows, arbitration_id: int, first_counter: int) -> None:
+    """Count the messages of one id on from `first_counter` and write their checks, last of all.
+
+    By AUTOSAR E2E: CAN FD messages with profile 5, classic ones with profile 2, and the data ids
+    that go with the arbitration id.
+    """
+    counters = first_counter + np.arange(len(rows))
+    as_bytes = rows.view(np.uint8).reshape(len(rows), rows.itemsize)
+    if rows.dtype["crc"].itemsize == 2:
+        rows["alive"] = counters & 0xFF
+        rows["crc"] = crc_p5_rows(as_bytes, data_id_of(arbitration_id))
+    else:
+        rows["alive"] = rows["alive"] & 0xF0 | (counters & 0x0F).astype(np.uint8)
+        rows["crc"] = crc_p2_rows(as_bytes, data_ids_of(arbitration_id))
 
 
 def _status(forecasts: ForecastSet, num_modes: int, stride: int) -> Rows:

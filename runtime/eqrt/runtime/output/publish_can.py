@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import can
-import numpy as np
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.bus.buses import carries_fd
-from eqrt.runtime.output.can_output import Offset, Rows, encode_classic, encode_fd
+from eqrt.runtime.bus.buses import Sender, carries_fd
+from eqrt.runtime.output.can_output import Offset, Rows, encode_classic, encode_fd, protect
 from eqrt.runtime.output.forecasts import ForecastSet
 
 BASE_ID = 0x6E0
@@ -22,7 +21,7 @@ class CanPublisher:
     A message that the bus does not take is counted and given up; nothing is raised or waited for.
     """
 
-    def __init__(self, bus: can.BusABC, *, base_id: int = BASE_ID, num_modes: int = 1) -> None:
+    def __init__(self, bus: Sender, *, base_id: int = BASE_ID, num_modes: int = 1) -> None:
         """`num_modes`: how many of an object's modes to send on CAN FD, most probable first.
 
         Raises UsageError if the ids from `base_id` on are not all standard or all extended.
@@ -40,11 +39,15 @@ class CanPublisher:
         self._base_id = base_id
         self._num_modes = num_modes
         self._alive = dict.fromkeys(Offset, 0)
-        self.is_fd = carries_fd(bus)
         self.sent = 0
         """Messages that the bus took."""
         self.failed = 0
         """Messages that it did not: its buffer was full, or it is down."""
+
+    @property
+    def is_fd(self) -> bool:
+        """Whether it sends CAN FD; that may change while a channel is down."""
+        return carries_fd(self._bus)
 
     def publish(self, forecasts: ForecastSet) -> None:
         """Send the messages of one cycle."""
@@ -53,27 +56,22 @@ class CanPublisher:
         else:
             messages = encode_classic(forecasts)
         for offset, rows in messages:
-            self._count(offset, rows)
+            protect(rows, self._base_id + offset, self._alive[offset])
+            self._alive[offset] = (self._alive[offset] + len(rows)) & 0xFF
             self._send(self._base_id + offset, rows)
 
     def counts(self) -> dict[str, int]:
         """Since the start, by name."""
         return {"can_sent": self.sent, "can_failed": self.failed}
 
-    def _count(self, offset: Offset, rows: Rows) -> None:
-        """Number the messages of one id, so that a consumer sees if one was lost."""
-        counts = self._alive[offset] + np.arange(len(rows))
-        rows["alive"] |= (counts & (0xFF if self.is_fd else 0x0F)).astype(np.uint8)
-        self._alive[offset] = (self._alive[offset] + len(rows)) & 0xFF
-
     def _send(self, arbitration_id: int, rows: Rows) -> None:
-        payload, size = rows.tobytes(), rows.itemsize
+        payload, size, is_fd = rows.tobytes(), rows.itemsize, self.is_fd
         for start in range(0, len(payload), size):
             message = can.Message(
                 arbitration_id=arbitration_id,
                 is_extended_id=arbitration_id > _LAST_STANDARD_ID,
-                is_fd=self.is_fd,
-                bitrate_switch=self.is_fd,
+                is_fd=is_fd,
+                bitrate_switch=is_fd,
                 is_rx=False,
                 data=payload[start : start + size],
             )

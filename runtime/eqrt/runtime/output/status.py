@@ -10,13 +10,15 @@ class BusStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     channel: str
     state: str
-    """UP, DOWN, BUS_OFF or ERROR_PASSIVE."""
+    """Name of a `BusState`: UP, ERROR_PASSIVE, BUS_OFF or DOWN."""
     since_s: float
     """How long it has been so."""
+    reason: str = ""
+    """Why it is not up."""
     losses: int = 0
-    """Times that it went away."""
+    """Times that it went down or away."""
     overflow: int = 0
-    """Messages that the kernel threw away because the service was too slow to fetch them."""
+    """Messages that found the kernel's receive queue full."""
     error_frames: int = 0
 
 

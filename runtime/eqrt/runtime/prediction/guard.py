@@ -26,6 +26,8 @@ TURNING_MPS = 3.0
 """Slower than this, a limit of curvature would be one of centimetres."""
 MAX_GAIN_MPS = 10.0
 """A target measured to be faster than its class allows may go on so, and this much faster."""
+MAX_SPEED_MPS = 90.0
+"""But never faster than anything on a public road."""
 _SUM_TOLERANCE = 1e-3
 
 
@@ -43,14 +45,14 @@ class Limits:
 
 
 LIMITS = {
-    ObjectClass.UNKNOWN: Limits(90.0, 15.0, 15.0, np.inf),
-    ObjectClass.CAR: Limits(90.0, 15.0, 15.0, 0.5),
+    ObjectClass.UNKNOWN: Limits(MAX_SPEED_MPS, 15.0, 15.0, np.inf),
+    ObjectClass.CAR: Limits(MAX_SPEED_MPS, 15.0, 15.0, 0.5),
     ObjectClass.TRUCK: Limits(50.0, 13.0, 11.0, 0.35),
-    ObjectClass.MOTORCYCLE: Limits(90.0, 15.0, 15.0, 0.7),
+    ObjectClass.MOTORCYCLE: Limits(MAX_SPEED_MPS, 15.0, 15.0, 0.7),
     ObjectClass.BICYCLE: Limits(25.0, 10.0, 10.0, 1.5),
     ObjectClass.PEDESTRIAN: Limits(12.0, 10.0, 10.0, np.inf),
     ObjectClass.ANIMAL: Limits(25.0, 15.0, 15.0, np.inf),
-    ObjectClass.STATIC: Limits(90.0, 15.0, 15.0, np.inf),  # the sensor may be wrong
+    ObjectClass.STATIC: Limits(MAX_SPEED_MPS, 15.0, 15.0, np.inf),  # the sensor may be wrong
 }
 _TABLE = np.array(
     [
@@ -129,8 +131,9 @@ def _possible(
     step = np.diff(path, axis=2) / dt_s  # (B, K, H - 1, 2) m/s
     rows = _TABLE[np.minimum(known, len(_TABLE) - 1)]
     max_speed, *others = rows.T[..., None, None]  # (B, 1, 1) each
-    measured = np.linalg.norm(velocity, axis=-1)[:, None, None] + MAX_GAIN_MPS
-    within = (np.linalg.norm(step, axis=-1) <= np.maximum(max_speed, measured)).all(axis=-1)
+    measured = np.linalg.norm(velocity, axis=-1)[:, None, None]
+    max_speed = np.maximum(max_speed, np.minimum(measured + MAX_GAIN_MPS, MAX_SPEED_MPS))
+    within = (np.linalg.norm(step, axis=-1) <= max_speed).all(axis=-1)
     within &= (first_m <= START_M) & _turns_possibly(step, dt_s, *others)
     return np.asarray(within.all(axis=1))
 

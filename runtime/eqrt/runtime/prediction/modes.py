@@ -17,6 +17,7 @@ class ModeKeeper:
     """Remembers when each degradation was last seen."""
 
     def __init__(self) -> None:
+        self._now_s = -math.inf
         self._seen_s = dict.fromkeys(_BY_RANK, -math.inf)
 
     def cycle(self, reasons: AbstractSet[Mode], now_s: float) -> Mode:
@@ -24,9 +25,10 @@ class ModeKeeper:
 
         The gravest that holds, or held within HOLD_S: FALLBACK, NO_POSE, LATE, NO_MAP; else RUN.
         """
+        if now_s < self._now_s:  # the clock was set back: what it said before means nothing
+            self._seen_s = dict.fromkeys(_BY_RANK, -math.inf)
+        self._now_s = now_s
         for mode in reasons:
             self._seen_s[mode] = now_s
-        for mode, seen_s in self._seen_s.items():
-            if 0.0 <= now_s - seen_s < HOLD_S:  # a clock that was set back forgets
-                return mode
-        return Mode.RUN
+        held = (mode for mode, seen_s in self._seen_s.items() if now_s - seen_s < HOLD_S)
+        return next(held, Mode.RUN)

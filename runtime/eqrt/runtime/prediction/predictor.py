@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from eqrt.core.contract import METADATA_KEY, ModelContract
 from eqrt.core.errors import ContractError
 from eqrt.core.scene import Scene
+from eqrt.runtime.prediction.model_file import parse_model_file
 from eqrt.runtime.prediction.stored_vectors import read_vector, vector_folders
 
 if TYPE_CHECKING:
@@ -70,11 +71,13 @@ class Predictor:
     def load(cls, folder: Path, threads: int = 1) -> Self:
         """Check and load an artifact.
 
-        Raises ContractError if a file is missing or damaged, the contract is another version, the
-        graph's tensors differ from it, or the test vector comes out differently.
+        Raises ContractError if a file is missing or damaged, the model has weights in other files,
+        the contract is another version, the graph's tensors differ from it, or the test vector
+        comes out differently.
         """
         content = _read_checked(folder)
         session = _session(content, folder, threads)
+        _check_self_contained(content, folder)
         metadata = session.get_modelmeta().custom_metadata_map
         text = metadata.get(METADATA_KEY)
         if text is None:
@@ -215,6 +218,21 @@ def _session(content: bytes, folder: Path, threads: int) -> onnxruntime.Inferenc
             f"{folder / 'model.onnx'}: onnxruntime {onnxruntime.__version__} cannot load it "
             f"({first_line})"
         ) from error
+
+
+def _check_self_contained(content: bytes, folder: Path) -> None:
+    """Weights in other files, which onnxruntime would read, are not covered by the checksum."""
+    path = folder / "model.onnx"
+    try:
+        external = parse_model_file(content).external
+    except (ValueError, IndexError, RecursionError) as error:
+        raise ContractError(
+            f"{path}: cannot tell what is in it ({error}); copy it again"
+        ) from error
+    if external:
+        raise ContractError(
+            f"{path}: the weights of {external[0]!r} are in another file; export the model as one"
+        )
 
 
 def _check_tensors(session: Any, contract: ModelContract, folder: Path) -> None:

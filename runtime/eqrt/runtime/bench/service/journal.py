@@ -16,6 +16,7 @@ from eqrt.runtime.bench.measure import Samples
 from eqrt.runtime.bench.percentiles import Int64
 from eqrt.runtime.bench.resources import cpu_ns
 from eqrt.runtime.bench.schedule import CLOCK
+from eqrt.runtime.bus.health import BusHealth
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.service import MAX_QUEUED_S, Publisher, Receiver
@@ -94,6 +95,14 @@ class NotingReceiver:
         if message is not None:
             self._journal.had(message)
         return message
+
+    def health(self) -> Sequence[BusHealth]:
+        """As the receiver's own."""
+        return self._receiver.health()
+
+    def counts(self) -> dict[str, int]:
+        """As the receiver's own."""
+        return self._receiver.counts()
 
 
 class NotingPublisher:

@@ -12,14 +12,15 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-import can
 import numpy as np
 
+from eqrt.core.errors import BusError
 from eqrt.runtime.bench.resources import Watch, resident_mib
 from eqrt.runtime.bench.schedule import CLOCK
 from eqrt.runtime.bench.service.journal import Journal, NotingPublisher, NotingReceiver
 from eqrt.runtime.bench.service.orders import ServiceOrder, read_order, say, while_wanted
-from eqrt.runtime.bus.buses import open_bus
+from eqrt.runtime.bus.links import opener
+from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.publish_can import CanPublisher
 from eqrt.runtime.pipeline import Pipeline
@@ -46,16 +47,21 @@ def serve(import_ns: int, bare_mib: float) -> None:
         stationary=order.stationary,
         clock=time.monotonic,
     )
-    wanted, ids = order.bus, profile.arbitration_ids
+    bus = order.bus
     with (
-        open_bus(wanted.channel, wanted.interface, fd=wanted.fd, receive_ids=ids) as bus,
+        Receiver(opener(bus.interface, fd=bus.fd), {bus.channel: profile.ids}, _lost) as receiver,
         while_wanted() as should_stop,
     ):
         ready_ns = CLOCK()
         say("ready", import_ns=import_ns, load_ns=ready_ns - begun_ns, bare_mib=bare_mib)
         run = _Run(order, pipeline, ready_ns)
-        run.serve(bus, predictor.contract.dt_s, should_stop)
+        run.serve(receiver, predictor.contract.dt_s, should_stop)
         run.tell()
+
+
+def _lost(line: str) -> None:
+    """A channel that comes and goes makes no figures."""
+    raise BusError(line)
 
 
 class AnsweredClock:
@@ -85,12 +91,12 @@ class _Run:
         self._watch: Watch | None = None
         self._started_ns = self._end_ns = 0
 
-    def serve(self, bus: can.BusABC, dt_s: float, should_stop: Callable[[], bool]) -> None:
+    def serve(self, receiver: Receiver, dt_s: float, should_stop: Callable[[], bool]) -> None:
         """Between two hooks; ends when told to, or when everything has been measured."""
-        journal = self._journal
+        journal, bus = self._journal, receiver.connection(self._order.bus.channel)
         service = Service(
             self._pipeline,
-            NotingReceiver(bus, journal),
+            NotingReceiver(receiver, journal),
             [NotingPublisher(CanPublisher(bus), journal)],
             clock=AnsweredClock(journal, dt_s) if self._order.answered_clock else ArrivalClock(),
         )
