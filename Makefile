@@ -9,7 +9,7 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint conformance conformance-table bench figures load under-load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table bench figures load under-load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -28,6 +28,12 @@ lint: $(VENV)/.installed ## check format, style, types, and who imports whom
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
+
+docs: $(VENV)/.installed ## build the documentation into site/, ready to be read offline
+	$(VENV)/bin/mkdocs build --strict
+
+cli-reference: $(VENV)/.installed ## write docs/cli.md from the parsers of the commands
+	PYTHONPATH=tests $(VENV)/bin/python -m documentation.cli_reference --write
 
 conformance: $(RUNTIME_VENV)/.installed ## run the shipped models in other runtimes and stacks (deploy/examples)
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m conformance.run
@@ -48,7 +54,7 @@ load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a servic
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60
 
 clean: ## remove the environments and everything else that was made here
-	rm -rf .venv .venv-* build dist .*_cache .benchmarks .hypothesis .conformance
+	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance
 	rm -rf deploy/examples/build deploy/examples/javascript/node_modules
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

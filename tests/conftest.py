@@ -9,4 +9,4 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 if not (find_spec("torch") and find_spec("onnx")):
-    collect_ignore = ["export", "packaging", "training"]
+    collect_ignore = ["documentation", "export", "packaging", "training"]

@@ -12,6 +12,7 @@ import importlib
 import importlib.metadata
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NoReturn
 
 from eqrt.core.errors import EqrtError, UsageError
@@ -21,6 +22,7 @@ COMMANDS = {
     "serve": ("eqrt.runtime.serve", "predict from a CAN bus, publish on CAN and as datagrams"),
     "doctor": ("eqrt.runtime.doctor.command", "check machine, bus, model and map: what to do"),
     "play": ("eqrt.runtime.play", "put a recorded log on a CAN bus"),
+    "can": ("eqrt.runtime.can_check.command", "check a sensor's profile against a recorded log"),
     "replay": ("eqrt.runtime.replay", "run the service on a recorded log, offline, repeatably"),
     "replay-fleet": (
         "eqrt.export.replay_fleet",
@@ -94,17 +96,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_command(name: str, argv: list[str]) -> int:
-    module_name, summary = COMMANDS[name]
+    module = command_module(name)
+    return int(module.run(command_parser(name, module).parse_args(argv)))
+
+
+def command_module(name: str) -> ModuleType:
+    """The module of a subcommand. Raises UsageError if an extra that it needs is not installed."""
     try:
-        module = importlib.import_module(module_name)
+        return importlib.import_module(COMMANDS[name][0])
     except ModuleNotFoundError as error:
         extra = EXTRA_OF.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         raise missing_extra(f"eqrt {name}", error.name or "", extra) from error
-    parser = Parser(prog=f"eqrt {name}", description=summary, allow_abbrev=False)
+
+
+def command_parser(name: str, module: ModuleType) -> Parser:
+    """What reads the options of a subcommand."""
+    parser = Parser(prog=f"eqrt {name}", description=COMMANDS[name][1], allow_abbrev=False)
     module.add_arguments(parser)
-    return int(module.run(parser.parse_args(argv)))
+    return parser
 
 
 def missing_extra(what: str, module: str, extra: str) -> UsageError:

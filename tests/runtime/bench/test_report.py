@@ -15,7 +15,6 @@ import pytest
 from bench_reports import MS, case, documented_keys, report
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.bench.baseline import compare
-from eqrt.runtime.bench.charts import log_ticks, round_ticks
 from eqrt.runtime.bench.json_form import parse, read_json, to_json
 from eqrt.runtime.bench.measure import distribution
 from eqrt.runtime.bench.page import render_page
@@ -27,6 +26,7 @@ from eqrt.runtime.bench.table import (
     comparison_lines,
     heading_lines,
 )
+from eqrt.runtime.drawing.axes import log_ticks, round_ticks
 
 KEPT = Punctuality(ticks=700, misses=1, skipped=0, wake_up=distribution(np.full(700, MS // 20)))
 NOISY = np.random.default_rng(3).lognormal(15.0, 1.0, 7_000).astype(np.int64).tolist()

@@ -7,39 +7,14 @@ Everything is drawn in a box 400 wide, which keeps its letters readable on a pho
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from html import escape
-from math import ceil, floor, log10
 
 from eqrt.runtime.bench.report import Course, Histogram, WorkloadResult
+from eqrt.runtime.drawing.axes import Axis, shown
 
 WIDTH, HEIGHT = 400, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 8, 32, 30
 _BAR = 22
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """Values to pixels; `low` < `high`."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-    log: bool = False
-
-    def at(self, value: float) -> float:
-        """The pixel of a value, kept inside the axis."""
-        low, high = self._scaled(self.low), self._scaled(self.high)
-        share = (self._scaled(min(max(value, self.low), self.high)) - low) / (high - low)
-        return self.start + share * (self.end - self.start)
-
-    def ticks(self) -> list[float]:
-        """Round values on the axis, three to eight of them."""
-        return log_ticks(self.low, self.high) if self.log else round_ticks(self.low, self.high)
-
-    def _scaled(self, value: float) -> float:
-        return log10(value) if self.log else value
 
 
 def histogram_chart(histogram: Histogram, marks: dict[str, int]) -> str:
@@ -87,29 +62,6 @@ def stages_chart(workload: WorkloadResult) -> str:
         parts.append(_box(104, top, width, _BAR, "bar"))
         parts.append(_text(110 + width, top + 16, f"{mean:.3f} ms", "start"))
     return _svg(parts, "mean time of each stage", height=4 + len(stages) * (_BAR + 8))
-
-
-def log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten between two numbers above 0, with 2 and 5 times them where there is room.
-
-    Where there are fewer than two of these, round values at equal distances.
-    """
-    powers = range(floor(log10(low)), ceil(log10(high)) + 1)
-    for factors in ((1, 2, 5), (1,)):
-        ticks = [factor * 10.0**power for power in powers for factor in factors]
-        inside = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-        if len(inside) <= 6:
-            return inside if len(inside) > 1 else round_ticks(low, high)
-    return inside[:: ceil(len(inside) / 6)]
-
-
-def round_ticks(low: float, high: float) -> list[float]:
-    """Multiples of 1, 2 or 5 times a power of ten between two numbers."""
-    rough = (high - low) / 4
-    power = 10.0 ** floor(log10(rough))
-    step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
-    first = ceil(low / step - 1e-9)
-    return [step * i for i in range(first, floor(high / step + 1e-9) + 1)]
 
 
 def _axis_x(low: float, high: float) -> Axis:
@@ -163,11 +115,6 @@ def _box(x: float, y: float, width: float, height: float, style: str) -> str:
 def _text(x: float, y: float, text: str, anchor: str, style: str = "label") -> str:
     place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
     return f'<text class="{style}" {place}>{escape(text)}</text>'
-
-
-def shown(value: float) -> str:
-    """A tick's label."""
-    return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
 
 
 def _svg(parts: Sequence[str], title: str, height: int = HEIGHT) -> str:

@@ -18,6 +18,8 @@ _MAX_STANDARD_ID, _MAX_EXTENDED_ID = 0x7FF, 0x1FFFFFFF
 class Address:
     """One message on the bus."""
 
+    name: str
+    """In the DBC."""
     arbitration_id: int
     is_extended: bool
     checksum: Check | None
@@ -54,6 +56,7 @@ def address_of(
     if isinstance(check, E2eCheck):
         counter = counter_signal(check)
     return Address(
+        name=message.name,
         arbitration_id=arbitration_id,
         is_extended=message.is_extended,
         checksum=check,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from html import escape
 
 from eqrt.core.errors import EqrtError
-from eqrt.runtime.bench.charts import Axis, log_ticks, round_ticks, shown
 from eqrt.runtime.bench.report import counted
 from eqrt.runtime.bench.side_by_side.report import SideBySide, middle_ns
+from eqrt.runtime.drawing.axes import Axis, log_ticks, round_ticks, shown
 
 _WIDTH, _HEIGHT = 640, 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 24, 36, 48

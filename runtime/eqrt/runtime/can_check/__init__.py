@@ -1,0 +1,1 @@
+"""`eqrt can check`: what a profile makes of a recorded log, and whether that can be right."""

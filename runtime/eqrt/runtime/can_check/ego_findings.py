@@ -1,0 +1,62 @@
+"""What looks wrong with the car's own speed and yaw rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from eqrt.runtime.can_check.ego_course import EgoCourse
+from eqrt.runtime.can_check.report import Finding, Fit, Values
+from eqrt.runtime.can_check.scale import tells, unit_hint, wrong_factor
+
+_MAX_SPEED_MPS, _MAX_LATERAL_MPS2 = 90.0, 12.0
+_FEW = 30
+
+
+def ego_findings(
+    values: tuple[Values, ...], fits: tuple[Fit, ...], course: EgoCourse
+) -> Iterator[Finding]:
+    """Everything about the car's own motion."""
+    rows = {row.name: row for row in values}
+    texts = [*_ego_value_texts(rows, course), *(text for one in fits for text in _ego_fit(one))]
+    for text in texts:
+        yield Finding(about="ego", text=text)
+
+
+def _ego_value_texts(rows: dict[str, Values], course: EgoCourse) -> Iterator[str]:
+    speed, yaw = rows["speed"], rows["yaw rate"]
+    if (
+        speed.median is not None
+        and max(abs(speed.p5 or 0.0), abs(speed.p95 or 0.0)) > _MAX_SPEED_MPS
+    ):
+        yield f"the speed goes from {speed.low:.0f} to {speed.high:.0f} m/s: is the unit right?"
+    if speed.median is not None and speed.median < -2.0:
+        yield f"the car mostly drives backward ({speed.median:.1f} m/s): sign, or `reverse`"
+    if speed.count >= _FEW and speed.low == speed.high and speed.low:
+        yield f"the speed is always {speed.low:g} m/s: is it the right signal?"
+    if yaw.count >= _FEW and yaw.low == yaw.high:
+        yield f"the yaw rate is always {yaw.low:g} deg/s: is it the right signal?"
+    if yaw.median is None:
+        return
+    if len(course.speed_s):
+        sideways = np.abs(course.yaw_rate_rad_s * course.speed_at(course.yaw_rate_s))
+        if (hard := float(np.nanquantile(sideways, 0.95))) > _MAX_LATERAL_MPS2:
+            yield (
+                f"speed times yaw rate is {hard:.0f} m/s² and more for 5 % of the time, which no "
+                "tyre holds: degrees taken for radians, or a wrong unit of the speed?"
+            )
+    if abs(yaw.median) > 60.0:
+        yield f"the yaw rate is {yaw.median:.0f} deg/s in the middle: is the unit right?"
+
+
+def _ego_fit(one: Fit) -> Iterator[str]:
+    if not tells(one) or one.correlation is None or one.slope is None:
+        return
+    if one.correlation < -0.3:
+        yield f"the poses change against the {one.what}: one of the two has the wrong sign"
+    elif one.correlation > 0.3 and (factor := wrong_factor(one)):
+        yield (
+            f"the poses change by {one.slope:.3g} of what the {one.what} says"
+            f"{unit_hint(1.0 / factor, one)}"
+        )

@@ -1,0 +1,60 @@
+"""What looks wrong with the messages themselves, before anything of them is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from eqrt.runtime.can_check.report import Finding, ProfileMessage
+from eqrt.runtime.decoding.decoder_counters import DecoderCounters
+from eqrt.runtime.decoding.profile import Profile
+
+
+def message_findings(messages: tuple[ProfileMessage, ...]) -> Iterator[Finding]:
+    """Messages that did not come, or came damaged."""
+    for user in dict.fromkeys(message.used_by for message in messages):
+        needed = [m for m in messages if m.used_by == user and not m.optional]
+        absent = [m for m in needed if not m.rhythm.count]
+        if absent and len(absent) == len(needed):
+            names = _listed([f"{m.name} ({m.id})" for m in absent])
+            yield Finding(about=user, text=f"none of its messages came: {names}")
+        elif absent:
+            names = _listed([f"{m.name} ({m.id})" for m in absent])
+            yield Finding(about=user, text=f"never came: {names}")
+    for message in messages:
+        yield from _damage(message)
+
+
+def left_out_findings(profile: Profile, counters: DecoderCounters) -> Iterator[Finding]:
+    """Objects that were announced and do not count; empty slots of a radar with slots are none."""
+    if any(sensor.framing != "counted" for sensor in profile.sensors):
+        return
+    announced = counters.objects + counters.invalid_objects
+    if counters.invalid_objects > 0.1 * announced:
+        yield Finding(
+            about=", ".join(sensor.name for sensor in profile.sensors),
+            text=f"{counters.invalid_objects} of {announced} objects are left out: `valid` does "
+            "not hold for them, or they share their `id` with another of the same cycle",
+        )
+
+
+def _damage(message: ProfileMessage) -> Iterator[Finding]:
+    count = message.rhythm.count
+    for number, what in (
+        (message.short, "are too short for what the profile reads of them; is this the right DBC?"),
+        (message.bad_checksum, "fail their checksum; if all do, its kind or byte is wrong"),
+        (message.bad_counter, "do not follow in the counter: lost messages, or the wrong signal"),
+    ):
+        if number > max(2, 0.01 * count):
+            yield Finding(about=message.name, text=f"{number} of {count} {what}")
+    if len(message.channels) > 1:
+        buses = " and ".join(message.channels)
+        yield Finding(
+            about=message.name,
+            text=f"comes on {buses}: both are read; say which bus is meant with --can ROLE=NAME",
+        )
+
+
+def _listed(names: list[str]) -> str:
+    """The first few names, and how many more."""
+    shown = ", ".join(names[:4])
+    return shown if len(names) <= 4 else f"{shown} and {len(names) - 4} more"

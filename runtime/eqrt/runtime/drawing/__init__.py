@@ -1,0 +1,1 @@
+"""What the SVG charts of several commands share."""

@@ -1,0 +1,306 @@
+"""`eqrt can check`: right mappings pass, and each kind of wrong one is said in plain words."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from can_recordings import DATA
+from eqrt import cli
+from eqrt.runtime.bus.logs import read_log
+from eqrt.runtime.can_check.check import check
+from eqrt.runtime.can_check.motion import fit, pairs
+from eqrt.runtime.can_check.observation import observe
+from eqrt.runtime.can_check.report import Report
+from eqrt.runtime.decoding.profile import load_profile
+from source_tree import ROOT
+
+DECODING = ROOT / "runtime/eqrt/runtime/decoding"
+DEMO = ROOT / "runtime/eqrt/runtime/demo/data/ngsim.log.gz"
+LOGS = {
+    "ars408": DATA / "ars408/candump.log.gz",
+    "toyota-rav4": DATA / "rav4/candump.log.gz",
+    "srr520": DATA / "srr520/candump.log.gz",
+    "generic": DEMO,
+}
+
+
+def report_of(profile: str, log: Path) -> Report:
+    loaded = load_profile(profile)
+    return check(loaded, observe(read_log(log), loaded), str(log)).report
+
+
+def said_about(report: Report) -> str:
+    return "\n".join(f"{finding.about}: {finding.text}" for finding in report.findings)
+
+
+def broken(folder: Path, profile: str, old: str, new: str) -> str:
+    """A copy of a built-in profile in which one thing is wrong."""
+    text = (DECODING / f"profiles/{profile}.toml").read_text()
+    assert text.count(old) == 1, f"{old!r} is there {text.count(old)} times"
+    path = folder / f"broken-{profile}.toml"
+    path.write_text(text.replace(old, new))
+    return str(path)
+
+
+@pytest.mark.parametrize("profile", list(LOGS))
+def test_nothing_looks_wrong_in_a_right_profile(profile: str) -> None:
+    report = report_of(profile, LOGS[profile])
+    assert report.decoded
+    assert said_about(report) == ""
+
+
+def test_counts_rates_and_gaps_are_those_of_the_log() -> None:
+    report = report_of("ars408", LOGS["ars408"])
+    rows = {row.name: row for row in report.profile_messages}
+    assert rows["Obj_0_Status"].rhythm.count == 2001
+    assert rows["Obj_0_Status"].rhythm.median_period_s == pytest.approx(0.0702, abs=1e-4)
+    assert rows["Obj_1_General"].rhythm.count == report.sensors[0].objects == 5609
+    assert rows["Obj_1_General"].used_by == "ars408"
+    assert rows["Obj_2_Quality"].optional
+    assert rows["SpeedInformation"].used_by == "ego"
+    assert {row.id: row.rhythm.count for row in report.unknown} == {"0x201": 144, "0x700": 144}
+    assert report.unknown_rest == (0, 0)
+    assert [(c.name, c.known, c.unknown) for c in report.channels] == [("can0", 24590, 288)]
+
+
+def test_ten_unknown_ids_are_shown_and_the_rest_is_counted() -> None:
+    report = report_of("toyota-rav4", LOGS["toyota-rav4"])
+    assert len(report.unknown) == 10
+    counts = [row.rhythm.count for row in report.unknown]
+    assert counts == sorted(counts, reverse=True)
+    known = sum(row.rhythm.count for row in report.profile_messages)
+    assert known + sum(counts) + report.unknown_rest[1] == report.messages == 98_800
+
+
+def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
+    log = tmp_path / "gap.log"
+    times_s = [0.0, 0.05, 0.10, 0.15, 0.65, 0.70]
+    log.write_text("".join(f"({100 + t:.6f}) can0 300#0000\n" for t in times_s))
+    report = report_of("ars408", log)
+    rhythm = next(r for r in report.profile_messages if r.name == "SpeedInformation").rhythm
+    assert rhythm.count == 6
+    assert rhythm.median_period_s == pytest.approx(0.05)
+    assert rhythm.worst_gap_s == pytest.approx(0.5)
+    assert rhythm.worst_gap_at_s == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(
+    ("profile", "old", "new", "said"),
+    [
+        (
+            "toyota-rav4",
+            'range_rate = "REL_SPEED"',
+            'range_rate = { signal = "REL_SPEED", sign = -1 }',
+            r"toyota: distance changes against range_rate .*wrong sign",
+        ),
+        (
+            "toyota-rav4",
+            'range_rate = "REL_SPEED"',
+            'range_rate = { signal = "REL_SPEED", unit = "km/h" }',
+            r"toyota: distance changes by 3\.6 m .*: m/s taken for km/h\?",
+        ),
+        (
+            "toyota-rav4",
+            'y = { signal = "LAT_DIST", sign = -1 }',
+            'y = "LAT_DIST"',
+            r"toyota: when the car turns, .* sign of y",
+        ),
+        (
+            "toyota-rav4",
+            'x = "LONG_DIST"',
+            'x = { signal = "LONG_DIST", sign = -1 }',
+            r"toyota: 100% of the objects are behind",
+        ),
+        (
+            "toyota-rav4",
+            'x = "LONG_DIST"',
+            'x = { signal = "LONG_DIST", unit = "cm" }',
+            r"toyota: distance (does not change as|changes by 0\.0)",
+        ),
+        (
+            "toyota-rav4",
+            '"wheels.WHEEL_SPEED_RL"]',
+            '"wheels.WHEEL_SPEED_RL"]\nunit = "m/s"',
+            r"toyota: .* stand on the ground .* 0\.278 times .*: km/h taken for m/s\?",
+        ),
+        (
+            "toyota-rav4",
+            'yaw_rate = "YAW_RATE"',
+            'yaw_rate = { signal = "YAW_RATE", sign = -1 }',
+            r"toyota: when the car turns, .* of the yaw rate",
+        ),
+        (
+            "toyota-rav4",
+            'yaw_rate = "YAW_RATE"',
+            'yaw_rate = { signal = "YAW_RATE", unit = "rad/s" }',
+            r"ego: speed times yaw rate is .* no tyre holds: degrees taken for radians",
+        ),
+        (
+            "toyota-rav4",
+            'message = "TRACK_A_{slot}"\ncounter = "COUNTER"\nchecksum = { kind = "sum8"',
+            'message = "TRACK_A_{slot}"\ncounter = "COUNTER"\nchecksum = { kind = "xor8"',
+            r"TRACK_A_0: 1\d+ of 1200 fail their checksum",
+        ),
+        (
+            "ars408",
+            'velocity_x = "general.Obj_VrelLong"',
+            'velocity_x = { signal = "general.Obj_VrelLong", sign = -1 }',
+            r"ars408: x changes against velocity_x .*wrong sign",
+        ),
+        (
+            "ars408",
+            'y = "general.Obj_DistLat"',
+            'y = { signal = "general.Obj_DistLat", sign = -1 }',
+            r"ars408: y changes against velocity_y .*wrong sign",
+        ),
+        (
+            "generic",
+            'velocity_x = { signal = "motion.VX"',
+            'velocity_x = { unit = "km/h", signal = "motion.VX"',
+            r"generic: velocities fit .* if divided by 0\.278 .*: m/s taken for km/h\?",
+        ),
+        (
+            "ars408",
+            "timeout_s = 0.05 ",
+            "timeout_s = 0.0005 ",
+            r"ars408: \d+ of 2001 cycles are incomplete: .*timeout_s is too short",
+        ),
+        (
+            "srr520",
+            'id = "OBJ{object}_ID"',
+            'id = "OBJ{object}_LIFE_CYCLES"',
+            r"srr520: 18 of 40 objects are left out: .* share their `id`",
+        ),
+        (
+            "generic",
+            'velocity = "absolute"',
+            'velocity = "relative"',
+            r'generic: velocities fit .* better as velocity = "absolute"',
+        ),
+        (
+            "generic",
+            'speed = { signal = "SPEED"',
+            'speed = { unit = "km/h", signal = "SPEED"',
+            r"ego: the poses change by 3\.61 of what the speed says: m/s taken for km/h\?",
+        ),
+        (
+            "generic",
+            'yaw_rate = { signal = "YAW_RATE"',
+            'yaw_rate = { sign = -1, signal = "YAW_RATE"',
+            r"generic: when the car turns, .* of the yaw rate",
+        ),
+    ],
+)
+def test_a_broken_mapping_is_named(
+    tmp_path: Path, profile: str, old: str, new: str, said: str
+) -> None:
+    report = report_of(broken(tmp_path, profile, old, new), LOGS[profile])
+    assert re.search(said, said_about(report)), said_about(report)
+
+
+def test_the_wrong_byte_order_is_named(tmp_path: Path) -> None:
+    """LONG_DIST read as little-endian: its high byte is then another signal's."""
+    dbc = (DECODING / "dbc/opendbc/toyota_adas.dbc").read_text(encoding="latin-1")
+    wrong, times = re.subn(r"(SG_ LONG_DIST : )15\|15@0\+", r"\g<1>8|15@1+", dbc)
+    assert times == 16
+    (tmp_path / "wrong.dbc").write_text(wrong, encoding="latin-1")
+    profile = broken(
+        tmp_path, "toyota-rav4", 'dbc = "opendbc/toyota_adas.dbc"', 'dbc = "wrong.dbc"'
+    )
+    said = said_about(report_of(profile, LOGS["toyota-rav4"]))
+    assert re.search(r"toyota: \d+% of the steps .*byte order", said), said
+
+
+def test_a_sensor_with_other_ids_is_found(tmp_path: Path) -> None:
+    profile = broken(
+        tmp_path, "ars408", 'name = "ars408"', 'name = "ars408"\narbitration_id_offset = 0x10'
+    )
+    report = report_of(profile, LOGS["ars408"])
+    assert "ars408: none of its messages came: Obj_0_Status (0x61A)" in said_about(report)
+    assert "ars408: the same pattern of ids is there 0x10 lower: add -0x10" in said_about(report)
+    assert report.decoded  # the ego's speed and yaw rate are
+
+
+def test_the_wrong_profile_decodes_nothing_and_the_status_says_so(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["can", "check", str(LOGS["ars408"]), "--profile", "sbg-ins"]) == 1
+    said = capsys.readouterr().out
+    assert "NOTHING DECODED" in said
+    assert "ego: none of its messages came: " in said
+
+
+def test_another_channel_is_not_read(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["can", "check", str(LOGS["ars408"]), "--profile", "ars408", "--can", "can7"]
+    assert cli.main(arguments) == 1
+    assert "wrong_bus 24590" in capsys.readouterr().out
+
+
+def test_the_report_as_text_json_and_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, pictures = tmp_path / "found.json", tmp_path / "pictures"
+    arguments = ["can", "check", str(LOGS["toyota-rav4"]), "--profile", "toyota-rav4"]
+    assert cli.main([*arguments, "--json", str(found), "--plot", str(pictures)]) == 0
+    said = capsys.readouterr().out
+    assert "Sensor toyota: 1200 cycles (0 incomplete), period 49.9 ms" in said
+    assert "and 96 more ids" in said
+    values = json.loads(found.read_text())
+    assert values["schema"] == 1
+    assert values["sensors"][0]["objects"] == 10_100
+    names = ["ego", "toyota-places", "toyota-range", "toyota-velocity"]
+    assert sorted(path.stem for path in pictures.iterdir()) == names
+    for name in names:
+        assert f"drawn: {pictures / name}.svg" in said
+        root = ET.fromstring((pictures / f"{name}.svg").read_text())
+        drawn = [path.get("d", "") for path in root.iter("{http://www.w3.org/2000/svg}path")]
+        assert max(map(len, drawn)) > 1_000, name
+
+
+def test_places_are_drawn_ahead_up_and_left_to_the_left(tmp_path: Path) -> None:
+    """One object ahead on the left, and the sensor: it is above and left of it."""
+    log = tmp_path / "one.log"
+    x, y = round((40.0 + 500.0) / 0.2), round((10.0 + 204.6) / 0.2)
+    bits = (7 << 56) | (x << 43) | (y << 32) | (512 << 22) | (256 << 12)
+    log.write_text(f"(1.000000) can0 60A#01000010\n(1.001000) can0 60B#{bits:016X}\n")
+    pictures = tmp_path / "pictures"
+    arguments = ["can", "check", str(log), "--profile", "ars408", "--plot", str(pictures)]
+    assert cli.main(arguments) == 0
+    text = (pictures / "ars408-places.svg").read_text()
+    clipped = text.partition("clip-path=")[2].partition("</g>")[0]
+    objects, sensor = re.findall(r'd="M([\d.]+),([\d.]+)h0"', clipped)
+    assert float(objects[0]) < float(sensor[0])
+    assert float(objects[1]) < float(sensor[1])
+
+
+def test_a_file_that_cannot_be_written_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["can", "check", str(LOGS["srr520"]), "--profile", "srr520"]
+    assert cli.main([*arguments, "--json", str(tmp_path / "no/file.json")]) == 2
+    assert capsys.readouterr().err.startswith("eqrt: cannot write ")
+
+
+def test_two_tracks_are_never_compared_with_each_other() -> None:
+    time_s = np.array([0.0, 0.5, 1.0, 0.0, 0.5, 1.0])
+    track = np.array([0, 0, 0, 1, 1, 1])
+    place = np.array([0.0, 1.0, 2.0, 50.0, 49.0, 48.0])
+    said = np.array([2.0, 2.0, 2.0, -2.0, -2.0, -2.0])
+    found = pairs(time_s, track, place, said)
+    np.testing.assert_allclose(found.changed, [2.0, 2.0, -2.0, -2.0])
+    np.testing.assert_allclose(found.said, found.changed)
+    one = fit("x", found)
+    assert (one.pairs, one.slope, one.correlation, one.residual) == (4, 1.0, 1.0, 0.0)
+
+
+def test_a_gap_in_what_is_said_leaves_its_pairs_out() -> None:
+    time_s = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+    said = np.array([1.0, np.nan, 1.0, 1.0, 1.0])
+    found = pairs(time_s, np.zeros(5, np.int64), time_s, said)
+    np.testing.assert_allclose(found.said, [1.0])
