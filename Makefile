@@ -9,7 +9,7 @@ RUNTIME_VENV ?= .venv-runtime
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table bench figures load under-load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table bench figures faults soak load under-load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -53,6 +53,14 @@ under-load: $(RUNTIME_VENV)/.installed ## measure the service beside three busy 
 load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a service, in 2 minutes; nothing may be lost
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60
 
+faults: $(VENV)/.installed ## throw faults at messages, machine and model, then kill the service 100 times; in 6 minutes
+	FAULT_EXAMPLES=200 $(VENV)/bin/python -m pytest -q tests/faults/test_pipeline_machine.py
+	@PYTHONPATH=tests $(VENV)/bin/python -m faults.campaign
+	@PYTHONPATH=tests $(VENV)/bin/python -m faults.restarts
+
+soak: $(RUNTIME_VENV)/.installed ## a simulated day and a real hour of traffic, in 2 hours
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m soak.run
+
 clean: ## remove the environments and everything else that was made here
 	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance
 	rm -rf deploy/examples/build deploy/examples/javascript/node_modules
@@ -65,7 +73,7 @@ PIP_INSTALL = -m pip install -qq --disable-pip-version-check --constraint constr
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(call create_environment,$(VENV),the workstation: torch and linters)
 	@$(VENV)/bin/python $(PIP_INSTALL) 'pip>=25.1'
-	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps,data,scale,sim]' --group dev
+	@$(VENV)/bin/python $(PIP_INSTALL) --editable '.[export,maps,data,scale,sim,bridges]' --group dev
 	@touch $@
 
 $(RUNTIME_VENV)/.installed: pyproject.toml constraints.txt

@@ -79,6 +79,10 @@ class Serving:
                 return found[1]
         raise AssertionError(self.end())
 
+    def send(self, number: signal.Signals) -> None:
+        """A signal."""
+        self._process.send_signal(number)
+
     def end(self, by: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
         """Tell it to end: exit status, the rest of its output, its errors."""
         self._process.send_signal(by)

@@ -23,10 +23,17 @@ COMMANDS = {
     "doctor": ("eqrt.runtime.doctor.command", "check machine, bus, model and map: what to do"),
     "play": ("eqrt.runtime.play", "put a recorded log on a CAN bus"),
     "can": ("eqrt.runtime.can_check.command", "check a sensor's profile against a recorded log"),
-    "replay": ("eqrt.runtime.replay", "run the service on a recorded log, offline, repeatably"),
+    "replay": (
+        "eqrt.runtime.replay",
+        "run the service on a log or recording again, offline; compare",
+    ),
     "replay-fleet": (
         "eqrt.export.replay_fleet",
         "replay a folder of logs, on all cores or a cluster",
+    ),
+    "convert": (
+        "eqrt.export.bridges.convert",
+        "turn a recording into Foxglove, ROS 2, candump or JSON files (extra: bridges)",
     ),
     "tile": ("eqrt.runtime.tile_command", "look at a map tile, or build one"),
     "prepare": ("eqrt.export.prepare", "cut recordings into training windows (extra: train)"),
@@ -66,6 +73,9 @@ EXTRA_OF = {  # third-party module -> the extra that brings it
     "onnx": "export",
     "onnxscript": "export",
     "lanelet2": "maps",
+    "foxglove_schemas_protobuf": "bridges",
+    "google": "bridges",
+    "rosbags": "bridges",
 }
 
 

@@ -282,15 +282,20 @@ FAULTS: dict[str, tuple[float, Fault, Callable[..., AbstractContextManager[tuple
 
 def process_faults() -> Iterator[Outcome]:
     """All of them, one after the other."""
-    for name, (seconds, fault, served) in FAULTS.items():
-        channel = next(CHANNELS)
-        with (
-            Heard(channel, []) as heard,
-            served(channel, heard) as (pid, model),
-            Sensor(channel) as sensor,
-        ):
-            world = World(sensor, channel, heard, pid, model)
-            yield _outcome(name, seconds, fault, world)
+    for name in FAULTS:
+        yield process_fault(name)
+
+
+def process_fault(name: str) -> Outcome:
+    """One of FAULTS: good traffic, the fault, good traffic until all is well."""
+    seconds, fault, served = FAULTS[name]
+    channel = next(CHANNELS)
+    with (
+        Heard(channel, []) as heard,
+        served(channel, heard) as (pid, model),
+        Sensor(channel) as sensor,
+    ):
+        return _outcome(name, seconds, fault, World(sensor, channel, heard, pid, model))
 
 
 def _outcome(name: str, seconds: float, fault: Fault, world: World) -> Outcome:

@@ -27,6 +27,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     ".trc": can.TRCWriter,
 }
 SOME = 300
+OF_PYTHON_CAN = [suffix for suffix in FORMATS if suffix != ".mcap"]  # ours: test_recording.py
 
 
 def write_log(path: Path, messages: Iterable[can.Message]) -> Path:
@@ -166,7 +167,7 @@ def test_garbage_lines_are_counted_skipped_and_reported(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", OF_PYTHON_CAN)
 @pytest.mark.parametrize("packed", ["", ".gz"])
 def test_every_format_gives_the_messages_that_were_written(
     suffix: str, packed: str, tmp_path: Path
@@ -213,7 +214,7 @@ def test_a_log_that_ends_mid_line_is_read_up_to_there(
             )
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", OF_PYTHON_CAN)
 def test_a_gzip_file_that_ends_early_is_read_up_to_there(suffix: str, tmp_path: Path) -> None:
     messages = recorded(5000)
     whole = write_log(tmp_path / f"drive{suffix}.gz", messages).read_bytes()
@@ -284,7 +285,7 @@ def test_an_unknown_format_names_the_known_ones(name: str, tmp_path: Path) -> No
         read_log(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", [*FORMATS, ".log.gz", ".blf.gz"])
+@pytest.mark.parametrize("suffix", [*OF_PYTHON_CAN, ".log.gz", ".blf.gz"])
 @pytest.mark.parametrize("content", [b"", b"\n\n", b"no such thing\n", b"\x00\xff" * 500])
 def test_a_log_without_a_message_is_refused(suffix: str, content: bytes, tmp_path: Path) -> None:
     """In one line that names the file."""

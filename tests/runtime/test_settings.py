@@ -59,6 +59,11 @@ def test_every_flag_is_a_key_and_every_key_a_flag(tmp_path: Path) -> None:
         "log_format": "json",
         "log_level": "error",
         "metrics": "127.0.0.1:2",
+        "record": "/r",
+        "record_limit": "3G",
+        "record_keep_free": "2G",
+        "record_when_full": "delete-oldest",
+        "record_file_size": "3M",
         "realtime_priority": 7,
         "realtime_cpus": "0,2-3",
     }
@@ -125,7 +130,10 @@ def test_the_name_of_a_profile_is_not_taken_for_a_file(tmp_path: Path) -> None:
         ),
         ("[serve]\nzzz = 1\n", r"line 2: unknown key 'zzz' in \[serve\]; known are profile, "),
         ("\n\n[realtym]\n", r"line 3: unknown table 'realtym'; did you mean 'realtime'\?"),
-        ("profile = 'a'\n", r"line 1: unknown table 'profile'; known are serve, realtime"),
+        (
+            "profile = 'a'\n",
+            r"line 1: unknown table 'profile'; known are serve, recording, realtime",
+        ),
         ("serve = 1\n", r"line 1: serve is a table: write \[serve\]"),
         ("[serve]\n# can\ncan = 'c'\n", r"line 3: can is \"c\", expected a list of strings"),
         ("[serve]\ncan = [\n'c', 1]\n", r"line 2: can is \[.*\], expected a list of strings"),

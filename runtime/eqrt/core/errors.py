@@ -42,3 +42,7 @@ class AbsentBusError(BusError):
 
 class LogError(EqrtError):
     """A recorded log cannot be read."""
+
+
+class RecordingError(EqrtError):
+    """A recording cannot be written."""

@@ -1,7 +1,9 @@
 """`eqrt replay`: run the service on a recorded log, offline, on the log's own clock.
 
 As fast as the machine can, and repeatable: the same log, profile, tile and model give the same
-bytes. Writes one JSON line per prediction (docs/output.md).
+bytes. Writes one JSON line per prediction (docs/output.md). A recording of eqrt's own
+(docs/recording.md) brings its profile and tile along, and gives the predictions that the service
+made, to the last bit.
 """
 
 from __future__ import annotations
@@ -24,17 +26,31 @@ from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.recording.reader import is_recording, read_recordings
+from eqrt.runtime.recording.replaying import Instead, recorded_pipeline, replay_recording
+from eqrt.runtime.recording.steps import ReplayedClock
+from eqrt.runtime.run_diff import compare_runs, table
 from eqrt.runtime.serve import load_pipeline
 from eqrt.runtime.serve_options import add_pipeline_arguments
+
+DIFFERS = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt replay`."""
-    parser.epilog = "example: eqrt replay drive.log --profile ars408 --out predictions.jsonl"
-    parser.add_argument(
-        "log", type=Path, metavar="LOG", help="candump .log, .asc, .blf or .trc, also with .gz"
+    parser.epilog = (
+        "example: eqrt replay drive.log --profile ars408 --out predictions.jsonl. Exit status with "
+        "--diff: 0 the runs are identical, 1 they differ"
     )
-    add_pipeline_arguments(parser)
+    parser.add_argument(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="candump .log, .asc, .blf or .trc, also with .gz; or a recording of eqrt serve "
+        "--record, a .mcap or the folder of them",
+    )
+    add_pipeline_arguments(parser, of_recordings=True)
     parser.add_argument(
         "--can",
         action="append",
@@ -45,32 +61,170 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out",
-        required=True,
         metavar="FILE",
         help="where to write a JSON line per prediction (docs/output.md); - = standard output",
+    )
+    diff = parser.add_mutually_exclusive_group()
+    diff.add_argument(
+        "--diff",
+        type=Path,
+        metavar="RUN",
+        help="compare with the predictions in RUN: a recording, a folder of them, or JSON lines",
+    )
+    diff.add_argument(
+        "--diff-model",
+        type=Path,
+        metavar="FOLDER",
+        help="compare with the predictions of another model on the same log",
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay, and say in one line how it went."""
-    log = read_log(args.log)
-    profile = load_profile(args.profile)
-    channels = parse_channels(args.can, profile.roles)
-    pipeline = load_pipeline(args, profile, channels or None, clock=None)
+    """Replay, and say in one line how it went; compare, and say how the runs differ."""
+    if args.out is None and args.diff is None and args.diff_model is None:
+        raise UsageError("where should the predictions go? give --out FILE, or --diff RUN")
+    replayed = _replay_of(args, args.model)
+    out_name = args.out if args.out is not None else os.devnull
     started_s = time.perf_counter()
-    with output(args.out) as out:
-        for forecast in replay(pipeline, log):
-            out.write(json_lines(forecast))
+    with output(out_name) as out:
+        lines = _written(replayed, out)
+        if args.diff is None and args.diff_model is None:
+            for _ in lines:
+                pass
+            status = 0
+        else:
+            status = _compare(args, lines)
     seconds = time.perf_counter() - started_s
-    if log.remark:
-        print(f"eqrt: {log.remark}", file=sys.stderr)
-    counters, decoded = pipeline.counters, pipeline.decoder.counters
-    print(
-        f"eqrt replay: {log.messages} messages, {decoded.cycles} cycles, "
-        f"{decoded.objects} objects, {counters.targets} predictions in {seconds:.1f} s",
-        file=sys.stderr,
-    )
-    return 0
+    if replayed.remark:
+        print(f"eqrt: {replayed.remark}", file=sys.stderr)
+    print(f"eqrt replay: {replayed.summary()} in {seconds:.1f} s", file=sys.stderr)
+    return status
+
+
+def _written(replayed: _LogReplay | _RecordingReplay, out: BinaryIO) -> Iterator[bytes]:
+    """The JSON lines of a replay, each written as it is made."""
+    for forecast in replayed:
+        lines = json_lines(forecast)
+        out.write(lines)
+        yield from lines.splitlines()
+
+
+def _compare(args: argparse.Namespace, lines: Iterator[bytes]) -> int:
+    if args.diff is not None:
+        other, name = _lines_of(args.diff), args.diff.name
+    else:
+        forecasts = _replay_of(args, args.diff_model)
+        other = (line for forecast in forecasts for line in json_lines(forecast).splitlines())
+        name = args.diff_model.name
+    found = compare_runs(lines, other)
+    text = table(found, "the replay", name)
+    print(text, end="", file=sys.stderr if args.out == "-" else sys.stdout)
+    if found.is_none:
+        return 0
+    if not found.cycles:
+        print("eqrt: no cycle is in both; are they of the same drive and clock?", file=sys.stderr)
+    return DIFFERS
+
+
+def _lines_of(run: Path) -> Iterator[bytes]:
+    """The JSON lines of a run that was made before."""
+    if is_recording(run):
+        for recording in read_recordings(run):
+            for forecast in recording.forecasts():
+                yield from json_lines(forecast).splitlines()
+        return
+    try:
+        with run.open("rb") as stream:
+            yield from stream
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {run} ({error.strerror}); give --diff a recording or JSON lines"
+        ) from error
+
+
+def _replay_of(args: argparse.Namespace, model: Path | None) -> _LogReplay | _RecordingReplay:
+    if is_recording(args.log):
+        return _RecordingReplay(args, model)
+    return _LogReplay(args, model)
+
+
+class _LogReplay:
+    """A log, on the clock of its stamps."""
+
+    def __init__(self, args: argparse.Namespace, model: Path | None) -> None:
+        """Raises UsageError, LogError, and what loading profile, model and tile raises."""
+        if args.profile is None:
+            raise UsageError("a log does not say which sensor sent: add --profile NAME")
+        self._log = read_log(args.log)
+        profile = load_profile(args.profile)
+        channels = parse_channels(args.can, profile.roles)
+        args = argparse.Namespace(**vars(args) | {"model": model or DEFAULT_ARTIFACT})
+        self._pipeline = load_pipeline(args, profile, channels or None, clock=None)
+
+    def __iter__(self) -> Iterator[ForecastSet]:
+        return replay(self._pipeline, self._log)
+
+    @property
+    def remark(self) -> str | None:
+        """What could not be read."""
+        return self._log.remark
+
+    def summary(self) -> str:
+        """What went in and came out."""
+        return _summary(self._log.messages, [self._pipeline])
+
+
+class _RecordingReplay:
+    """Recordings, each on the clock of the service that made it."""
+
+    def __init__(self, args: argparse.Namespace, model: Path | None) -> None:
+        """Raises LogError."""
+        self._recordings = read_recordings(args.log)
+        self._args = args
+        self._model = model
+        self._pipelines: list[Pipeline] = []
+
+    def __iter__(self) -> Iterator[ForecastSet]:
+        notices: set[str | None] = {None}
+        for recording in self._recordings:
+            clock = ReplayedClock()
+            pipeline = recorded_pipeline(recording, self._instead(), clock)
+            model = pipeline.predictor
+            notice = model.license_notice if isinstance(model, Predictor) else None
+            if notice not in notices:
+                print(f"eqrt: {notice}", file=sys.stderr)
+                notices.add(notice)
+            self._pipelines.append(pipeline)
+            yield from replay_recording(recording, pipeline, clock)
+
+    def _instead(self) -> Instead:
+        args = self._args
+        return Instead(
+            profile=args.profile,
+            model=self._model,
+            tile=args.tile,
+            can=tuple(args.can),
+            stationary=args.stationary,
+        )
+
+    @property
+    def remark(self) -> str | None:
+        """What is missing, and why predictions may differ from those that were made."""
+        remarks = [remark for one in self._recordings if (remark := one.remark)]
+        if not all(one.is_whole for one in self._recordings):
+            remarks.append("after what is missing, predictions may differ from those made then")
+        return "; ".join(remarks) or None
+
+    def summary(self) -> str:
+        """What went in and came out."""
+        return _summary(sum(one.messages for one in self._recordings), self._pipelines)
+
+
+def _summary(messages: int, pipelines: list[Pipeline]) -> str:
+    cycles = sum(one.decoder.counters.cycles for one in pipelines)
+    objects = sum(one.decoder.counters.objects for one in pipelines)
+    targets = sum(one.counters.targets for one in pipelines)
+    return f"{messages} messages, {cycles} cycles, {objects} objects, {targets} predictions"
 
 
 def replay(pipeline: Pipeline, messages: Iterable[can.Message]) -> Iterator[ForecastSet]:

@@ -29,6 +29,9 @@ from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.recording.options import start_recorder
+from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.steps import TapedClock
 from eqrt.runtime.serve_options import NO_CHANNEL, add_arguments
 from eqrt.runtime.service import Chore, Observer, Publisher, Service
 from eqrt.runtime.settings import as_toml, namespace
@@ -78,8 +81,13 @@ def _serve(args: argparse.Namespace) -> int:
         heard = sorted(set(channels.values()))
         receiver = stack.enter_context(_receiver(args, profile, heard))
         several = channels if len(heard) > 1 else None
-        pipeline = load_pipeline(args, profile, several, clock=time.monotonic)
+        clock = TapedClock(time.monotonic) if args.record else None
+        pipeline = load_pipeline(args, profile, several, clock=clock or time.monotonic)
         publishers = _publishers(args, receiver, stack)
+        recorder = None
+        if clock:
+            recorder = stack.enter_context(start_recorder(args, pipeline, several, clock))
+            publishers.append(recorder)
         manager = stack.enter_context(ServiceManager.of())
         reloader = Reloader(
             pipeline, args.model, args.tile, is_asked=is_asked, log=log, tell=manager.reload
@@ -94,6 +102,7 @@ def _serve(args: argparse.Namespace) -> int:
             publishers,
             [*observers, manager.report],
             chores=[*chores, reloader, manager],
+            witness=recorder,
         )
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
         log.line("ready", f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends")
@@ -138,7 +147,7 @@ def _surroundings(
     """Who is told every second, and what is done between messages."""
     observers: list[Observer] = [] if args.quiet else [_Teller(log, receiver).say]
     observers.append(Changes(log))
-    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher)]
+    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher | Recorder)]
     chores: list[Chore] = []
     if args.realtime_gc_between_cycles:
         chores.append(Sweeper(lambda: pipeline.counters.cycles))
@@ -170,8 +179,8 @@ def _publishers(
     if (out := _out_channel(args)) is not None:
         bus = receiver.connection(out)
         publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
-    elif not args.datagrams:
-        raise UsageError("--out-can none and no --datagrams: the predictions would go nowhere")
+    elif not args.datagrams and not args.record:
+        raise UsageError("--out-can none, no --datagrams, no --record: predictions go nowhere")
     if args.datagrams:
         publishers.append(stack.enter_context(DatagramPublisher(args.datagrams)))
     return publishers

@@ -15,6 +15,7 @@ from eqrt.runtime.operation.realtime import parse_cpus, parse_priority
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS
 from eqrt.runtime.output.publish_can import BASE_ID
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
+from eqrt.runtime.recording.options import add_record_arguments
 from eqrt.runtime.settings import FileOrName, Settings, Switch
 
 NO_CHANNEL = "none"
@@ -79,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "one that is lost later is waited for in any case",
     )
     _add_reporting(parser)
+    add_record_arguments(parser)
     _add_realtime(parser)
     Settings(parser, "serve")
 
@@ -133,22 +135,28 @@ def _add_realtime(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_pipeline_arguments(parser: argparse.ArgumentParser) -> None:
-    """What `serve` and `replay` have in common."""
+def add_pipeline_arguments(parser: argparse.ArgumentParser, *, of_recordings: bool = False) -> None:
+    """What `serve` and `replay` have in common.
+
+    `of_recordings`: where input may be a recording, which says itself what it was made with;
+    profile and model are None if not given.
+    """
+    recorded = "; a recording has its own" if of_recordings else ""
     parser.add_argument(
         "--profile",
         type=FileOrName,
-        required=True,
+        required=not of_recordings,
         metavar="NAME|FILE",
         help=f"which sensor sends: {', '.join(builtin_profiles())}, or a profile of your own, "
-        "a .toml file (docs/profiles.md)",
+        f"a .toml file (docs/profiles.md){recorded}",
     )
     parser.add_argument(
         "--model",
         type=Path,
-        default=DEFAULT_ARTIFACT,
+        default=None if of_recordings else DEFAULT_ARTIFACT,
         metavar="FOLDER",
-        help="the predictor, as `eqrt export` writes it (default: the one that comes with eqrt)",
+        help="the predictor, as `eqrt export` writes it (default: the one that comes with eqrt"
+        f"{recorded})",
     )
     parser.add_argument(
         "--tile",

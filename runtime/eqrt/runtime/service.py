@@ -50,6 +50,18 @@ Chore = Callable[[], None]
 """Is done between two messages, when whatever they completed has been sent: must be quick."""
 
 
+class Witness(Protocol):
+    """Sees all that the pipeline is told, so that it can be told the same again."""
+
+    def begin(self, message: can.Message | None, now_s: float) -> None:
+        """The pipeline is about to be told this: `poll(now_s)`, then `feed`, if there is a
+        message.
+        """
+
+    def end(self) -> None:
+        """It has been, and what came of it is published."""
+
+
 class Service:
     """One pipeline between a receiver and its publishers."""
 
@@ -62,6 +74,7 @@ class Service:
         *,
         clock: Clock | None = None,
         chores: Sequence[Chore] = (),
+        witness: Witness | None = None,
     ) -> None:
         """`clock`: None = when messages arrive."""
         self._pipeline = pipeline
@@ -70,6 +83,7 @@ class Service:
         self._observers = observers
         self._clock = clock or ArrivalClock()
         self._chores = chores
+        self._witness = witness
         self._book = StatusBook(pipeline, receiver, publishers)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
@@ -79,10 +93,14 @@ class Service:
             message = self._receiver.recv(_NAP_S)
             stamp_s = None if message is None else message.timestamp
             now_s = self._clock.now_s(time.monotonic(), stamp_s, time.time())
+            if self._witness:
+                self._witness.begin(message, now_s)
             self._publish(self._pipeline.poll(now_s), now_s)
             if message is not None:
                 self._book.received()
                 self._publish(self._pipeline.feed(message, now_s), now_s)
+            if self._witness:
+                self._witness.end()
             if (monotonic_s := time.monotonic()) >= report_due_s:
                 report_due_s = self._report(monotonic_s, report_due_s)
             for chore in self._chores:

@@ -59,3 +59,19 @@ def candump_message(line: str) -> can.Message:
         bool(flags & 1),
         bool(flags & 2),
     )
+
+
+def candump_line(message: can.Message) -> str:
+    """The line that `candump_message` reads as this message, but for a microsecond's rounding."""
+    number = message.arbitration_id | (_ERROR_FLAG if message.is_error_frame else 0)
+    name = f"{number:08X}" if message.is_extended_id or message.is_error_frame else f"{number:03X}"
+    if message.is_remote_frame:
+        payload = f"#R{message.dlc}"
+    elif message.is_fd:
+        flags = message.bitrate_switch | 2 * message.error_state_indicator
+        payload = f"##{flags:X}{message.data.hex().upper()}"
+    else:
+        payload = f"#{message.data.hex().upper()}"
+    direction = "R" if message.is_rx else "T"
+    channel = "can0" if message.channel is None else message.channel
+    return f"({message.timestamp:.6f}) {channel} {name}{payload} {direction}\n"

@@ -1,7 +1,8 @@
 """Recorded CAN logs, one message after the other, from whatever the recorder wrote.
 
 candump text has a parser of its own, because replaying is a hot path; the other formats are read by
-python-can. Every one of them may be gzip'd. A recorder that was switched off leaves half a line, or
+python-can. Every one of them may be gzip'd. `.mcap` are recordings of eqrt itself
+(`eqrt.runtime.recording`). A recorder that was switched off leaves half a line, or
 half of a compressed block: a log is read up to there, and the reader says so.
 """
 
@@ -154,7 +155,20 @@ def _blf(stream: IO[bytes], reader: LogReader) -> Iterator[can.Message]:
         reader.end_early(f"ends early, after {blocks.position} of {log.file_size} bytes")
 
 
-FORMATS: dict[str, MessagesIn] = {".log": _candump, ".asc": _asc, ".blf": _blf, ".trc": _trc}
+def _mcap(stream: IO[bytes], reader: LogReader) -> Iterator[can.Message]:
+    # Imported here, because recordings are read through this module as well.
+    from eqrt.runtime.recording.reader import can_messages  # noqa: PLC0415
+
+    return can_messages(stream, reader)
+
+
+FORMATS: dict[str, MessagesIn] = {
+    ".log": _candump,
+    ".asc": _asc,
+    ".blf": _blf,
+    ".trc": _trc,
+    ".mcap": _mcap,
+}
 """Name of a log's format -> how it is read."""
 
 

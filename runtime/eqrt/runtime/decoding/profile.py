@@ -99,6 +99,22 @@ def load_profile(name_or_path: str) -> Profile:
     )
 
 
+def profile_files(name_or_path: str) -> dict[str, bytes]:
+    """The files that `load_profile` reads: the profile's name with `.toml`, and its DBCs, named as
+    the profile names them. Together in a folder they are the same profile.
+
+    Raises ProfileError if one cannot be read.
+    """
+    path = _path(name_or_path)
+    table = read_toml(path, ProfileTable)
+    names = sorted({s.dbc for s in table.sensor} | {ego.dbc for ego in table.ego})
+    try:
+        dbcs = {name: _dbc_path(name, path).read_bytes() for name in names}
+        return {path.name: path.read_bytes()} | dbcs
+    except OSError as error:
+        raise ProfileError(f"cannot read {error.filename}: {error.strerror}") from error
+
+
 def _problem(table: ProfileTable) -> str | None:
     if not table.sensor and not table.ego:
         return "there is neither a [[sensor]] nor an [[ego]] in it"

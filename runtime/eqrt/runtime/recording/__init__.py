@@ -1,0 +1,1 @@
+"""Recordings: all that went into the service and came out of it, as MCAP files."""

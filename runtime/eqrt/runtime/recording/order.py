@@ -1,0 +1,35 @@
+"""What the writer is told before the first entry."""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class Attached(msgspec.Struct, frozen=True):
+    """A file that travels in the recording."""
+
+    name: str
+    media_type: str
+    content: bytes
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True):
+    """One run of the service, and the limits of its recording."""
+
+    folder: str
+    run: str
+    """Eight hexadecimal digits, in the name of every file of this run."""
+    identity: dict[str, str]
+    attached: list[Attached]
+    schemas: dict[str, bytes]
+    """Topic -> the JSON schema of its messages."""
+    file_bytes: int
+    """A new file is begun when one is as large,"""
+    file_seconds: float
+    """or as old."""
+    total_bytes: int
+    """What all recordings in the folder may have together."""
+    free_bytes: int
+    """What the file system must keep free."""
+    delete_oldest: bool
+    """Make room by deleting the oldest recordings; else recording ends when there is none."""

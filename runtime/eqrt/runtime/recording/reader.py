@@ -1,0 +1,218 @@
+"""Reading recordings back: what the pipeline was told, and what it said then.
+
+A file that was cut, because its writer was killed or the power went, is read up to there.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Protocol, TypeVar
+
+import can
+import msgspec
+
+from eqrt.core.errors import LogError
+from eqrt.runtime.bus.logs import LogReader
+from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.recording.exact_forecasts import decode_forecasts
+from eqrt.runtime.recording.folder import SUFFIX, recordings_in, run_of
+from eqrt.runtime.recording.identity import Identity, read_identity
+from eqrt.runtime.recording.mcap_entries import Head, Raw, read_entries, read_head
+from eqrt.runtime.recording.steps import CanEntry, Lost, PollEntry, Step, can_message
+from eqrt.runtime.recording.topics import FORMAT_VERSION, Topic
+
+Entry = Step | ForecastSet | ServiceStatus | Lost
+"""What stands in a recording; a `Step` comes with its clock."""
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+EVERYTHING = frozenset(Topic)
+_STEPS = frozenset({Topic.CAN, Topic.POLL, Topic.CLOCK})
+_CAN = msgspec.msgpack.Decoder(CanEntry)
+_POLL = msgspec.msgpack.Decoder(PollEntry)
+_CLOCK = msgspec.msgpack.Decoder(tuple[float, ...])
+_STATUS = msgspec.json.Decoder(ServiceStatus)
+_LOST = msgspec.json.Decoder(Lost)
+
+
+class _Decoder(Protocol[T_co]):
+    """One of msgspec's, of either format."""
+
+    def decode(self, buf: bytes, /) -> T_co:
+        """Raises msgspec.MsgspecError."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """An entry, and when it was recorded."""
+
+    log_ns: int
+    """Wall-clock time, ns since 1970."""
+    entry: Entry
+
+
+class Recording:
+    """One run of the service, or what is there of it; can be read again from the start."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        """`paths`: its files in order. Raises LogError if the first is no recording."""
+        self.paths = tuple(paths)
+        self._head = _head(self.paths[0])
+        self.identity = _identity(self._head, self.paths[0])
+        self._reset()
+
+    def _reset(self) -> None:
+        self.messages = 0
+        """Read so far."""
+        self.lost = 0
+        """Steps that are known to be missing so far."""
+        self.cut: list[str] = []
+        """Which files read so far end early, and how."""
+
+    @property
+    def attached(self) -> dict[str, bytes]:
+        """The files that travel in it, by name."""
+        return self._head.attached
+
+    @cached_property
+    def gaps(self) -> list[str]:
+        """What is missing of the run's files."""
+        parts = [int(_identity(_head(path), path).part) for path in self.paths]
+        gaps = [f"begins in the middle of its run, with part {parts[0]}"] if parts[0] else []
+        return gaps + [
+            f"part {before + 1} is missing"
+            for before, after in itertools.pairwise(parts)
+            if after != before + 1
+        ]
+
+    @property
+    def remark(self) -> str | None:
+        """One line about what is missing, as far as it has been read; None if nothing is."""
+        lost = [f"{self.lost} steps were not recorded in time"] if self.lost else []
+        remarks = [*self.gaps, *self.cut, *lost]
+        return f"{self.paths[0]}: {'; '.join(remarks)}" if remarks else None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether a replay starts where the service started, and misses nothing on the way."""
+        return not self.gaps and not self.lost
+
+    def entries(self, topics: frozenset[Topic] = EVERYTHING) -> Iterator[Recorded]:
+        """Everything of some topics in recorded order. Raises LogError if it cannot be read."""
+        self._reset()
+        waiting: list[Recorded] = []
+        for raw in self._raw():
+            if raw.topic is Topic.LOST:
+                self.lost += _decoded(_LOST, raw.payload, self).steps
+            if raw.topic not in topics:
+                continue
+            if raw.topic is Topic.CLOCK:
+                _add_clock(waiting, _decoded(_CLOCK, raw.payload, self))
+                continue
+            if raw.topic in _STEPS:  # what the clock said during the one before is complete
+                yield from waiting
+                waiting.clear()
+            waiting.append(Recorded(raw.log_ns, self._entry(raw)))
+        yield from waiting
+
+    def steps(self) -> Iterator[Step]:
+        """All that the pipeline was told. Raises LogError if it cannot be read."""
+        return _only(Step, self.entries(_STEPS))
+
+    def forecasts(self) -> Iterator[ForecastSet]:
+        """All that it predicted. Raises LogError if it cannot be read."""
+        return _only(ForecastSet, self.entries(frozenset({Topic.FORECASTS})))
+
+    def _raw(self) -> Iterator[Raw]:
+        for path in self.paths:
+
+            def end_early(what: str, name: str = path.name) -> None:
+                self.cut.append(f"{name} {what}, read up to there")
+
+            try:
+                with path.open("rb") as stream:
+                    yield from read_entries(stream, str(path), end_early)
+            except OSError as error:
+                raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+    def _entry(self, raw: Raw) -> Entry:
+        if raw.topic is Topic.CAN:
+            self.messages += 1
+            entry = _decoded(_CAN, raw.payload, self)
+            return Step(entry.now_s, can_message(entry))
+        if raw.topic is Topic.POLL:
+            return Step(_decoded(_POLL, raw.payload, self).now_s, None)
+        if raw.topic is Topic.STATUS:
+            return _decoded(_STATUS, raw.payload, self)
+        if raw.topic is Topic.LOST:
+            return _decoded(_LOST, raw.payload, self)
+        try:
+            return decode_forecasts(raw.payload)
+        except ValueError as error:
+            raise LogError(f"{self.paths[0]}: {error}") from error
+
+
+def read_recordings(path: Path) -> list[Recording]:
+    """The recording in a file, or all in a folder: one per run of the service, oldest first.
+
+    Raises LogError if there is none.
+    """
+    if not path.is_dir():
+        return [Recording([path])]
+    runs: dict[str, list[Path]] = {}
+    for file in recordings_in(path):
+        runs.setdefault(run_of(file), []).append(file)
+    if not runs:
+        raise LogError(f"{path}: there is no recording of eqrt in it (eqrt-*{SUFFIX})")
+    return [Recording(files) for files in runs.values()]
+
+
+def is_recording(path: Path) -> bool:
+    """Whether its name says so: a folder, or a file in MCAP."""
+    return path.is_dir() or path.suffix.lower() == SUFFIX
+
+
+def can_messages(stream: IO[bytes], reader: LogReader) -> Iterator[can.Message]:
+    """The CAN messages of one file, at their own stamps: a log like any other."""
+    for raw in read_entries(stream, str(reader.path), reader.end_early):
+        if raw.topic is Topic.CAN:
+            yield can_message(_CAN.decode(raw.payload))
+
+
+def _add_clock(waiting: list[Recorded], said_s: tuple[float, ...]) -> None:
+    """To the step that waits, which is the first; before the first step there is nothing to do."""
+    if waiting and isinstance(step := waiting[0].entry, Step):
+        waiting[0] = replace(waiting[0], entry=replace(step, clock_s=step.clock_s + said_s))
+
+
+def _only(kind: type[T], recorded: Iterator[Recorded]) -> Iterator[T]:
+    return (one.entry for one in recorded if isinstance(one.entry, kind))
+
+
+def _decoded(decoder: _Decoder[T], payload: bytes, recording: Recording) -> T:
+    try:
+        return decoder.decode(payload)
+    except msgspec.MsgspecError as error:
+        raise LogError(f"{recording.paths[0]}: an entry cannot be read ({error})") from error
+
+
+def _head(path: Path) -> Head:
+    try:
+        with path.open("rb") as stream:
+            return read_head(stream, str(path))
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def _identity(head: Head, path: Path) -> Identity:
+    identity = read_identity(head.identity, path)
+    if identity.format != str(FORMAT_VERSION):
+        raise LogError(
+            f"{path}: is of format {identity.format}, this version of eqrt reads format "
+            f"{FORMAT_VERSION}; read it with eqrt {identity.eqrt}"
+        )
+    return identity

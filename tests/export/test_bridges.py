@@ -1,0 +1,270 @@
+"""Recordings for other programs, read back with those programs' own libraries."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mcap.reader
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from rosbags.highlevel import AnyReader
+
+from drives import DRIVES, first_seconds, shipped_predictor
+from eqrt.cli import main
+from eqrt.export.bridges.moments import Moment
+from eqrt.export.bridges.ros2 import PREDICTED_OBJECTS, TOPIC, autoware_types, moved_on
+from eqrt.runtime.bus.candump import candump_line, candump_message
+from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.json_lines import json_lines
+from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.recording.identity import attached_files, identity_of
+from eqrt.runtime.recording.json_schemas import json_schema
+from eqrt.runtime.recording.order import Order
+from eqrt.runtime.recording.reader import Recording, read_recordings
+from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.steps import Lost, TapedClock
+from eqrt.runtime.status_book import StatusBook
+from forecast_sets import one_car
+from source_tree import ROOT
+
+NGSIM = DRIVES["ngsim"]
+
+
+class Nowhere:
+    """No bus."""
+
+    def health(self) -> list[BusHealth]:
+        return []
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Two seconds of NGSIM, with its tile and one status."""
+    folder = tmp_path_factory.mktemp("recording")
+    now_s = 0.0
+    clock = TapedClock(lambda: now_s)  # no time passes while it computes
+    assert NGSIM.tile is not None
+    tile = load_tile(NGSIM.tile)
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), tile, clock=clock)
+    order = Order(
+        folder=str(folder),
+        run="00c0ffee",
+        identity=identity_of(pipeline, model_folder=Path(), channels=None, stationary=False),
+        attached=attached_files("generic", pipeline),
+        schemas={"/eqrt/status": json_schema(ServiceStatus), "/eqrt/lost": json_schema(Lost)},
+        file_bytes=1 << 30,
+        file_seconds=600.0,
+        total_bytes=1 << 40,
+        free_bytes=0,
+        delete_oldest=False,
+    )
+    with Recorder(order, clock) as recorder:
+        book = StatusBook(pipeline, Nowhere(), [recorder])
+        for line in first_seconds(NGSIM.log, 2.0).splitlines():
+            message = candump_message(line)
+            now_s = message.timestamp
+            recorder.begin(message, now_s)
+            for forecast in [*pipeline.poll(now_s), *pipeline.feed(message, now_s)]:
+                recorder.publish(forecast)
+            recorder.end()
+        recorder.report(book.close(time.monotonic() + 1.0))
+    (found,) = read_recordings(folder)
+    return found
+
+
+def convert(recording: Recording, kind: str, out: Path) -> None:
+    assert main(["convert", str(recording.paths[0]), "--to", kind, "--out", str(out)]) == 0
+
+
+# --- Foxglove
+
+
+@pytest.fixture(scope="module")
+def shown(
+    recording: Recording, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, list[tuple[int, bytes]]]:
+    """Topic -> time and content of its messages, as mcap's indexed reader finds them."""
+    file = tmp_path_factory.mktemp("foxglove") / "drive.mcap"
+    convert(recording, "foxglove", file)
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    with file.open("rb") as stream:
+        for schema, channel, message in mcap.reader.make_reader(stream).iter_messages():
+            assert schema is not None
+            found.setdefault(channel.topic, []).append((message.log_time, message.data))
+            if schema.encoding == "protobuf":
+                assert parsed_by_its_own_schema(schema.name, schema.data, message.data)
+    return found
+
+
+def parsed_by_its_own_schema(name: str, schema: bytes, content: bytes) -> object:
+    """What a program can read that knows the file alone."""
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file:
+        pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    return kind.FromString(content)
+
+
+def test_foxglove_sees_every_target_where_it_is(
+    recording: Recording, shown: dict[str, list[tuple[int, bytes]]]
+) -> None:
+    forecasts = list(recording.forecasts())
+    scenes = [SceneUpdate.FromString(content) for _, content in shown["/scene"]]
+    assert len(scenes) == len(forecasts) > 15
+    for scene, forecast in zip(scenes, forecasts, strict=True):
+        assert len(scene.entities) == forecast.num_targets
+        for row, entity in enumerate(scene.entities):
+            assert (entity.frame_id, entity.id) == ("map", f"track {forecast.track_id[row]}")
+            (box,) = entity.cubes
+            place = (box.pose.position.x, box.pose.position.y)
+            np.testing.assert_allclose(place, forecast.position[row])
+            _, *modes = entity.lines
+            points = [[(p.x, p.y) for p in line.points[1:]] for line in modes]
+            np.testing.assert_allclose(points, forecast.trajectories[row])
+            strength = [line.color.a for line in modes]
+            assert strength == sorted(strength, reverse=True)
+
+
+def test_foxglove_knows_where_the_ego_vehicle_is(
+    recording: Recording, shown: dict[str, list[tuple[int, bytes]]]
+) -> None:
+    last = list(recording.forecasts())[-1]
+    transform = FrameTransform.FromString(shown["/tf"][-1][1])
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("map", "ego")
+    assert transform.translation.x == last.map_from_ego.x_m
+    yaw_rad = 2.0 * math.atan2(transform.rotation.z, transform.rotation.w)
+    assert math.cos(yaw_rad - last.map_from_ego.yaw_rad) == pytest.approx(1.0)
+
+
+def test_foxglove_has_lanes_numbers_and_a_log(
+    recording: Recording, shown: dict[str, list[tuple[int, bytes]]]
+) -> None:
+    assert NGSIM.tile is not None
+    (lanes,) = SceneUpdate.FromString(shown["/lanes"][0][1]).entities
+    assert len(lanes.lines) == load_tile(NGSIM.tile).lane_map.num_lanes
+    cycles = [json.loads(content) for _, content in shown["/cycle"]]
+    objects = [forecast.num_targets for forecast in recording.forecasts()]
+    assert [cycle["objects"] for cycle in cycles] == objects
+    assert all(
+        isinstance(v, int | float) for v in cycles[-1].values()
+    )  # flat: PlotJuggler plots it
+    assert "predictions/s" in Log.FromString(shown["/log"][0][1]).message
+    assert json.loads(shown["/status"][0][1])["profile"] == "generic"
+    assert abs(shown["/cycle"][0][0] / 1e9 - time.time()) < 600.0  # the wall clock
+
+
+def test_the_layouts_show_topics_that_are_there(
+    shown: dict[str, list[tuple[int, bytes]]],
+) -> None:
+    layout = json.loads((ROOT / "deploy/viewers/foxglove-layout.json").read_text())
+    panels = layout["configById"]
+    three = next(panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert set(three["topics"]) == {"/scene", "/lanes"} <= set(shown)
+    plots = [panel for name, panel in panels.items() if name.startswith("Plot!")]
+    values = [path["value"] for panel in plots for path in panel["paths"]]
+    keys = json.loads(shown["/cycle"][0][1])
+    assert values
+    for value in values:
+        topic, _, field = value.partition(".")
+        assert topic == "/cycle"
+        assert field in keys
+
+
+# --- ROS 2
+
+
+def test_a_bag_has_autowares_predicted_objects(recording: Recording, tmp_path: Path) -> None:
+    """Read by rosbags as any bag, with the definitions that lie in it."""
+    convert(recording, "rosbag2", tmp_path / "bag")
+    forecasts = list(recording.forecasts())
+    with AnyReader([tmp_path / "bag"], default_typestore=autoware_types()) as reader:
+        (connection,) = reader.connections
+        assert (connection.topic, connection.msgtype) == (TOPIC, PREDICTED_OBJECTS)
+        read: list[Any] = [
+            reader.deserialize(content, connection.msgtype) for _, _, content in reader.messages()
+        ]
+    assert len(read) == len(forecasts)
+    for message, forecast in zip(read, forecasts, strict=True):
+        assert message.header.frame_id == "map"
+        assert len(message.objects) == forecast.num_targets
+        for row, one in enumerate(message.objects):
+            kinematics = one.kinematics
+            assert bytes(one.object_id.uuid)[8:] == int(forecast.track_id[row]).to_bytes(8, "big")
+            confidence = [path.confidence for path in kinematics.predicted_paths]
+            np.testing.assert_allclose(confidence, forecast.probabilities[row], atol=1e-6)
+            assert (kinematics.predicted_paths[0].time_step.nanosec) == 100_000_000
+            expected = moved_on(forecast, row, 0)
+            path = [(p.position.x, p.position.y) for p in kinematics.predicted_paths[0].path]
+            np.testing.assert_allclose(path, expected)
+
+
+def test_a_path_is_moved_on_to_the_time_of_the_message() -> None:
+    """38 ms at 10 m/s are 0.38 m; of 30 steps, 29 are left."""
+    path = moved_on(one_car(), 0, 0)
+    assert len(path) == 30
+    np.testing.assert_allclose(path[:, 0], 100.0)
+    np.testing.assert_allclose(path[:, 1], 220.38 + np.arange(30), atol=1e-9)
+    car = one_car()
+    now = replace(car, anchor_s=np.array([car.timestamp_s]))
+    np.testing.assert_allclose(moved_on(now, 0, 0)[1:], now.trajectories[0, 0])
+
+
+def test_a_bag_is_not_written_over(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["convert", str(recording.paths[0]), "--to", "rosbag2", "--out", str(tmp_path)]
+    assert main(command) == 2
+    assert "a new folder" in capsys.readouterr().err
+
+
+# --- text
+
+
+def test_candump_text_is_the_log_again(recording: Recording, tmp_path: Path) -> None:
+    convert(recording, "candump", tmp_path / "drive.log")
+    played = first_seconds(NGSIM.log, 2.0).splitlines()
+    written = (tmp_path / "drive.log").read_text().splitlines()
+    assert [line.split()[:3] for line in written] == [line.split()[:3] for line in played]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(1.000000) can0 123#R8 R\n",
+        "(1.000000) can1 384##1112233 T\n",
+        "(1.000000) can0 18DAF110#0211 R\n",
+        "(1.000000) can0 20000080#0000000000000000 R\n",
+        "(1.000000) can0 7FF# R\n",
+    ],
+)
+def test_every_kind_of_message_has_its_line(line: str) -> None:
+    assert candump_line(candump_message(line)) == line
+
+
+def test_json_lines_are_those_of_replay(recording: Recording, tmp_path: Path) -> None:
+    convert(recording, "jsonl", tmp_path / "out.jsonl")
+    expected = b"".join(map(json_lines, recording.forecasts()))
+    assert (tmp_path / "out.jsonl").read_bytes() == expected
+
+
+def test_times_are_told_by_the_wall_clock() -> None:
+    """A target measured 50 ms before its prediction was finished, 2 ms before it was recorded."""
+    car: ForecastSet = one_car()
+    moment = Moment(5_000_000_000, car)
+    assert moment.wall_ns(float(car.anchor_s[0])) == pytest.approx(4_950_000_000, abs=1000)
