@@ -15,7 +15,7 @@ MUTATION_MODULES ?=
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures view-figures faults soak load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures view-figures faults soak load under-load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -61,6 +61,9 @@ bench: $(VENV)/.installed ## measure against the budgets, in 9 minutes; wants a 
 
 figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, measured; wants it quiet
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/figures.py
+
+under-load: $(RUNTIME_VENV)/.installed ## measure the service beside three busy programs, with and without [realtime]; needs its rights
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/under_load.py
 
 load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a service, in 2 minutes; nothing may be lost
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -46,13 +47,14 @@ def eqrt(*arguments: str, cwd: Path | None = None, **more: str) -> subprocess.Co
 class Serving:
     """`eqrt serve` in a process, from when it is ready; ended at the end of the `with` block."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, command: Sequence[str] = EQRT, **more: str) -> None:
+        """`command`: what to run instead of `eqrt`; `more` goes into its environment."""
         self._process = subprocess.Popen(
-            [*EQRT, "serve", *arguments],
+            [*command, "serve", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=environment(),
+            env=environment(**more),
         )
         self.ready = ""
         """The first line it printed."""
@@ -68,6 +70,14 @@ class Serving:
         self.ready = self._process.stdout.readline()
         assert self.ready.startswith("eqrt serve: "), self.end()
         return self
+
+    def read_until(self, pattern: str) -> str:
+        """Read its output up to a line in which the pattern is: what its first group is there."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if found := re.search(pattern, line):
+                return found[1]
+        raise AssertionError(self.end())
 
     def send(self, number: signal.Signals) -> None:
         """A signal."""

@@ -20,6 +20,7 @@ from eqrt.core.errors import EqrtError, UsageError
 COMMANDS = {
     "demo": ("eqrt.runtime.demo.command", "see it work: recorded traffic, predicted and scored"),
     "serve": ("eqrt.runtime.serve", "predict from a CAN bus, publish on CAN and as datagrams"),
+    "doctor": ("eqrt.runtime.doctor.command", "check machine, bus, model and map: what to do"),
     "play": ("eqrt.runtime.play", "put a recorded log on a CAN bus"),
     "can": ("eqrt.runtime.can_check.command", "check a sensor's profile against a recorded log"),
     "replay": (

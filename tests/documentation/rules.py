@@ -30,6 +30,7 @@ NOT_RUN = (
     NotRun(r"", r"pip install ", "would change the environment that runs the tests"),
     NotRun(r"deploy/README", r"sudo ", "needs root; vcan.sh is tried in tests/socketcan"),
     NotRun(r"deploy/README|reliability", r"echo .* \| sudo tee ", "needs root"),
+    NotRun(r"deploy/README", r"/opt/eqrt/", "is installed as root; README.md has eqrt doctor"),
     NotRun(r"deploy/README", r"journalctl ", "needs systemd"),
     NotRun(r"deploy/README", r"docker ", "needs docker and a network"),
     NotRun(r"deploy/examples/README", r"", "`make conformance` runs this page, command by command"),
@@ -73,13 +74,16 @@ class Change:
 
 CHANGES = (
     Change(
-        r"^eqrt serve ",
+        r"^eqrt (serve|doctor) ",
         r"(--can (?:\w+=)?)(v?can\d)",
         r"\1docs-\2",
         "a channel of our own, which no other test is on",
     ),
     Change(
-        r"^eqrt serve ", r"$", " --can-interface eqrt_local", "there is no CAN in a test's kernel"
+        r"^eqrt (serve|doctor) ",
+        r"$",
+        " --can-interface eqrt_local",
+        "there is no CAN in a test's kernel",
     ),
     Change(
         r"^eqrt play ",

@@ -100,7 +100,7 @@ def test_user_errors_carry_their_exit_status() -> None:
     ("argv", "said"),
     [
         (["serve"], "--profile, --can; see eqrt serve --help"),
-        (["serve", "--can", "x", "--profil", "ars408"], "--profile; see eqrt serve --help"),
+        (["serve", "--can", "x", "--profil", "ars408"], "--profil ars408; see eqrt serve --help"),
         (["serve", "--can", "x", "--profile", "ars408", "--out-id", "z"], "not a CAN id"),
         (["replay", "a.log", "--profile", "ars408"], "give --out FILE, or --diff RUN"),
         (["tile", "build"], "SOURCE, --out; see eqrt tile build --help"),

@@ -29,7 +29,7 @@ from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import Tile, load_tile
 from eqrt.runtime.replay import output, replay
-from eqrt.runtime.serve import add_pipeline_arguments
+from eqrt.runtime.serve_options import add_pipeline_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

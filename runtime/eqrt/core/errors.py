@@ -16,6 +16,10 @@ class UsageError(EqrtError):
     exit_code = 2
 
 
+class ConfigError(UsageError):
+    """A configuration file cannot be used."""
+
+
 class ContractError(EqrtError):
     """A model file does not keep the contract this version speaks."""
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
 from eqrt.core.lane_choice import centerline_source
+from eqrt.core.scene import CenterlineSource
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
 from eqrt.runtime.decoding.profile import Profile
@@ -114,11 +115,7 @@ class Pipeline:
         self._clock = clock
         self._runner = Direct(predictor) if clock is None else Watched(predictor)
         self._forecaster = Forecaster(
-            predictor.contract,
-            self._runner,
-            centerline_source(tile.lane_map, predictor.contract) if tile else None,
-            self.tracks,
-            self.ego,
+            predictor.contract, self._runner, lanes_for(tile, predictor), self.tracks, self.ego
         )
         self._modes = ModeKeeper()
         self._nobody = Raw.silent(Targets.none(predictor.contract), predictor.contract)
@@ -150,6 +147,23 @@ class Pipeline:
     def finish(self, now_s: float) -> list[ForecastSet]:
         """Nothing more will come: close the cycles that are open."""
         return self._handle_all(self.decoder.poll(now_s + _FINISH_S), now_s)
+
+    def exchange(self, predictor: Model, tile: Tile | None, lanes: CenterlineSource | None) -> None:
+        """From the next cycle on, predict with these; `lanes` are `lanes_for` the two.
+
+        Tracks and ego motion stay, unless poses come as latitude and longitude and the new tile's
+        map frame has its origin elsewhere: then poses begin anew there, and histories with them.
+        """
+        origin_before = self.tile.info.origin_deg if self.tile else None
+        origin = tile.info.origin_deg if tile else None
+        self.predictor, self.tile = predictor, tile
+        self._runner = self._runner.succeeded_by(predictor)
+        self._forecaster = Forecaster(
+            predictor.contract, self._runner, lanes, self.tracks, self.ego
+        )
+        self._nobody = Raw.silent(Targets.none(predictor.contract), predictor.contract)
+        if origin != origin_before and self.decoder.set_map_origin(origin):
+            self.ego.leave_map()
 
     def _handle_all(self, events: list[Event], now_s: float) -> list[ForecastSet]:
         return [made for event in events if (made := self._handle(event, now_s)) is not None]
@@ -292,6 +306,11 @@ def _agent_modes(raw: Raw, guarded: Guarded) -> NDArray[np.uint8]:
     seen = np.where(raw.targets.valid.all(axis=1), Mode.RUN, Mode.PARTIAL)
     fell_back = np.where(raw.late, Mode.LATE, Mode.FALLBACK)
     return np.where(guarded.accepted, seen, fell_back).astype(np.uint8)
+
+
+def lanes_for(tile: Tile | None, predictor: Model) -> CenterlineSource | None:
+    """The tile's lanes as the model wants them chosen; takes milliseconds."""
+    return centerline_source(tile.lane_map, predictor.contract) if tile else None
 
 
 _NOTHING: list[ForecastSet] = []

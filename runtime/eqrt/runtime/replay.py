@@ -31,7 +31,8 @@ from eqrt.runtime.recording.reader import is_recording, read_recordings
 from eqrt.runtime.recording.replaying import Instead, recorded_pipeline, replay_recording
 from eqrt.runtime.recording.steps import ReplayedClock
 from eqrt.runtime.run_diff import compare_runs, table
-from eqrt.runtime.serve import add_pipeline_arguments, load_pipeline
+from eqrt.runtime.serve import load_pipeline
+from eqrt.runtime.serve_options import add_pipeline_arguments
 
 DIFFERS = 1
 

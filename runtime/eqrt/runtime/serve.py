@@ -8,135 +8,37 @@ import gc
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from eqrt.core.errors import UsageError
-from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.health import in_sum, trouble
 from eqrt.runtime.bus.ids import Ids
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
-from eqrt.runtime.decoding.profile import Profile, builtin_profiles, load_profile
-from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS, DatagramPublisher
-from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher
+from eqrt.runtime.decoding.profile import Profile, load_profile
+from eqrt.runtime.operation.changes import Changes
+from eqrt.runtime.operation.endpoint import Endpoint
+from eqrt.runtime.operation.event_log import LEVELS, EventLog, Level
+from eqrt.runtime.operation.realtime import Realtime, Sweeper, parse_cpus, refuse
+from eqrt.runtime.operation.reload import Reloader, identity
+from eqrt.runtime.operation.service_manager import ServiceManager
+from eqrt.runtime.output.datagrams import DatagramPublisher
+from eqrt.runtime.output.forecasts import Mode
+from eqrt.runtime.output.publish_can import CanPublisher
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import load_tile
-from eqrt.runtime.recording.options import add_record_arguments, start_recorder
+from eqrt.runtime.recording.options import start_recorder
 from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.steps import TapedClock
-from eqrt.runtime.service import Observer, Publisher, Service
-from eqrt.runtime.signals import until_told_to_stop
+from eqrt.runtime.serve_options import NO_CHANNEL, add_arguments
+from eqrt.runtime.service import Chore, Observer, Publisher, Service
+from eqrt.runtime.settings import as_toml, namespace
+from eqrt.runtime.signals import asked_to_reload, until_told_to_stop
 from eqrt.runtime.status_book import status_line
 
-NO_CHANNEL = "none"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `eqrt serve`."""
-    parser.epilog = "example: eqrt serve --can can0 --profile ars408 --tile town.tile"
-    add_pipeline_arguments(parser)
-    parser.add_argument(
-        "--can",
-        required=True,
-        action="append",
-        metavar="[ROLE=]CHANNEL",
-        help="the channel to listen on, such as can0; with ROLE= that of one of the profile's "
-        "buses, such as radar=can1 (repeatable)",
-    )
-    parser.add_argument(
-        "--can-interface",
-        metavar="IF",
-        help=f"python-can's name of the kind of adapter (default: socketcan; {LOCAL} needs no CAN "
-        "hardware)",
-    )
-    parser.add_argument(
-        "--fd",
-        action=argparse.BooleanOptionalAction,
-        help="open channels for CAN FD, or not: then predictions are sent as classic messages "
-        "(default: CAN FD if the channel can)",
-    )
-    parser.add_argument(
-        "--out-can",
-        metavar="CHANNEL",
-        help="the channel to send predictions on (default: the first --can); "
-        f"{NO_CHANNEL!r} = not on CAN",
-    )
-    parser.add_argument(
-        "--out-id",
-        type=_arbitration_id,
-        default=BASE_ID,
-        metavar="ID",
-        help=f"the first CAN id of the predictions (default {BASE_ID:#x})",
-    )
-    parser.add_argument(
-        "--out-modes",
-        type=int,
-        default=1,
-        metavar="N",
-        help="modes of each object sent on CAN FD, most probable first (default 1)",
-    )
-    parser.add_argument(
-        "--datagrams",
-        action="append",
-        default=[],
-        metavar="HOST:PORT",
-        help="send predictions as UDP datagrams too, to a viewer or recorder, such as "
-        f"{DEFAULT_ADDRESS} (repeatable)",
-    )
-    parser.add_argument(
-        "--wait-for-bus",
-        action="store_true",
-        help="at the start, wait for channels that are not there yet, or down (default: an error); "
-        "one that is lost later is waited for in any case",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no status line every second")
-    add_record_arguments(parser)
-
-
-def _arbitration_id(text: str) -> int:
-    """A CAN id, decimal or with 0x."""
-    try:
-        return int(text, 0)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a CAN id such as 0x6e0") from error
-
-
-def add_pipeline_arguments(parser: argparse.ArgumentParser, *, of_recordings: bool = False) -> None:
-    """What `serve` and `replay` have in common.
-
-    `of_recordings`: where input may be a recording, which says itself what it was made with;
-    profile and model are None if not given.
-    """
-    recorded = "; a recording has its own" if of_recordings else ""
-    parser.add_argument(
-        "--profile",
-        required=not of_recordings,
-        metavar="NAME|FILE",
-        help=f"which sensor sends: {', '.join(builtin_profiles())}, or a profile of your own, "
-        f"a .toml file (docs/profiles.md){recorded}",
-    )
-    parser.add_argument(
-        "--model",
-        type=Path,
-        default=None if of_recordings else DEFAULT_ARTIFACT,
-        metavar="FOLDER",
-        help="the predictor, as `eqrt export` writes it (default: the one that comes with eqrt"
-        f"{recorded})",
-    )
-    parser.add_argument(
-        "--tile",
-        type=Path,
-        metavar="FILE",
-        help="the map around, from `eqrt tile build` (default: predict without a map)",
-    )
-    parser.add_argument(
-        "--stationary",
-        action="store_true",
-        help="the sensor stands still: predict although no message tells its motion",
-    )
+__all__ = ["add_arguments", "run"]
 
 
 def load_pipeline(
@@ -161,10 +63,21 @@ def load_pipeline(
 
 def run(args: argparse.Namespace) -> int:
     """Open everything, then serve until SIGTERM or Ctrl-C."""
+    settings = args.settings.resolve(args)
+    if args.print_config:
+        print(as_toml(settings), end="")
+        return 0
+    return _serve(namespace(settings))
+
+
+def _serve(args: argparse.Namespace) -> int:
+    log = EventLog(args.log_format, LEVELS[args.log_level])
     profile = load_profile(args.profile)
     channels = parse_channels(args.can, profile.roles)
     with contextlib.ExitStack() as stack:
         should_stop = stack.enter_context(until_told_to_stop())
+        is_asked = stack.enter_context(asked_to_reload())
+        _become_realtime(args, log)
         heard = sorted(set(channels.values()))
         receiver = stack.enter_context(_receiver(args, profile, heard))
         several = channels if len(heard) > 1 else None
@@ -175,14 +88,73 @@ def run(args: argparse.Namespace) -> int:
         if clock:
             recorder = stack.enter_context(start_recorder(args, pipeline, several, clock))
             publishers.append(recorder)
-        observers = _observers(args, publishers, receiver)
-        service = Service(pipeline, receiver, publishers, observers, witness=recorder)
+        manager = stack.enter_context(ServiceManager.of())
+        reloader = Reloader(
+            pipeline, args.model, args.tile, is_asked=is_asked, log=log, tell=manager.reload
+        )
+        endpoint = _endpoint(args, stack)
+        observers, chores = _surroundings(
+            args, pipeline, receiver, publishers, log=log, endpoint=endpoint
+        )
+        service = Service(
+            pipeline,
+            receiver,
+            publishers,
+            [*observers, manager.report],
+            chores=[*chores, reloader, manager],
+            witness=recorder,
+        )
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
-        print(f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends", flush=True)
+        log.line("ready", f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends")
+        log.say(Level.INFO, "running", identity(pipeline.predictor, pipeline.tile))
+        if endpoint is not None:
+            log.say(Level.INFO, "metrics", f"http://{endpoint.address}/metrics and /health answer")
+        manager.ready()
         service.run(should_stop)
+        manager.stopping()
         troubles = in_sum(receiver.health())
-    print(f"eqrt serve: {_summary(pipeline)}" + (f"; {troubles}" if troubles else ""))
+    log.line("end", f"eqrt serve: {_summary(pipeline)}" + (f"; {troubles}" if troubles else ""))
     return 0
+
+
+def _become_realtime(args: argparse.Namespace, log: EventLog) -> None:
+    problems = Realtime(
+        priority=args.realtime_priority,
+        lock_memory=args.realtime_lock_memory,
+        cpus=parse_cpus(args.realtime_cpus) if args.realtime_cpus else None,
+    ).apply()
+    if args.realtime_strict:
+        refuse(problems)
+    for problem in problems:
+        log.say(Level.WARNING, "realtime", f"realtime {problem}")
+
+
+def _endpoint(args: argparse.Namespace, stack: contextlib.ExitStack) -> Endpoint | None:
+    if not args.metrics:
+        return None
+    return stack.enter_context(Endpoint(args.metrics, anywhere=args.metrics_anywhere))
+
+
+def _surroundings(
+    args: argparse.Namespace,
+    pipeline: Pipeline,
+    receiver: Receiver,
+    publishers: Sequence[Publisher],
+    *,
+    log: EventLog,
+    endpoint: Endpoint | None,
+) -> tuple[list[Observer], list[Chore]]:
+    """Who is told every second, and what is done between messages."""
+    observers: list[Observer] = [] if args.quiet else [_Teller(log, receiver).say]
+    observers.append(Changes(log))
+    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher | Recorder)]
+    chores: list[Chore] = []
+    if args.realtime_gc_between_cycles:
+        chores.append(Sweeper(lambda: pipeline.counters.cycles))
+    if endpoint is not None:
+        observers.append(endpoint.observe)
+        chores.append(endpoint)
+    return observers, chores
 
 
 def _receiver(args: argparse.Namespace, profile: Profile, channels: Sequence[str]) -> Receiver:
@@ -214,18 +186,11 @@ def _publishers(
     return publishers
 
 
-def _observers(
-    args: argparse.Namespace, publishers: Sequence[Publisher], receiver: Receiver
-) -> list[Observer]:
-    observers: list[Observer] = [] if args.quiet else [_Terminal(receiver).say]
-    observers += [one.report for one in publishers if isinstance(one, DatagramPublisher | Recorder)]
-    return observers
+class _Teller:
+    """Says every second how the service is, and what is wrong with its channels."""
 
-
-class _Terminal:
-    """A line every second: how the service is, and what is wrong with its channels."""
-
-    def __init__(self, receiver: Receiver) -> None:
+    def __init__(self, log: EventLog, receiver: Receiver) -> None:
+        self._log = log
         self._receiver = receiver
         self._before = receiver.health()
 
@@ -235,7 +200,17 @@ class _Terminal:
         text = trouble(self._before, health, time.monotonic())
         self._before = health
         line = status_line(status) + (f"  {text}" if text else "")
-        print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)
+        if not self._log.is_json:
+            self._log.line("status", f"{time.strftime('%H:%M:%S')} {line}")
+            return
+        self._log.line(
+            "status",
+            line,
+            mode=Mode(status.mode).name,
+            objects=status.objects,
+            messages=status.messages,
+            latency_ms=[round(1e3 * latency_s, 2) for latency_s in status.latencies_s],
+        )
 
 
 def _warn(line: str) -> None:

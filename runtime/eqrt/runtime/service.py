@@ -46,6 +46,9 @@ class Publisher(Protocol):
 Observer = Callable[[ServiceStatus], None]
 """Hears once a second how the service is."""
 
+Chore = Callable[[], None]
+"""Is done between two messages, when whatever they completed has been sent: must be quick."""
+
 
 class Witness(Protocol):
     """Sees all that the pipeline is told, so that it can be told the same again."""
@@ -68,8 +71,9 @@ class Service:
         receiver: Receiver,
         publishers: Sequence[Publisher],
         observers: Sequence[Observer] = (),
-        clock: Clock | None = None,
         *,
+        clock: Clock | None = None,
+        chores: Sequence[Chore] = (),
         witness: Witness | None = None,
     ) -> None:
         """`clock`: None = when messages arrive."""
@@ -78,6 +82,7 @@ class Service:
         self._publishers = publishers
         self._observers = observers
         self._clock = clock or ArrivalClock()
+        self._chores = chores
         self._witness = witness
         self._book = StatusBook(pipeline, receiver, publishers)
 
@@ -98,6 +103,8 @@ class Service:
                 self._witness.end()
             if (monotonic_s := time.monotonic()) >= report_due_s:
                 report_due_s = self._report(monotonic_s, report_due_s)
+            for chore in self._chores:
+                chore()
 
     def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
         for forecast in forecasts:

@@ -1,9 +1,10 @@
-"""Ctrl-C and SIGTERM as a question that a loop asks, so that it can end cleanly."""
+"""Signals as questions that a loop asks: to end cleanly, and to load its files anew."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
@@ -28,3 +29,28 @@ def until_told_to_stop() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def asked_to_reload() -> Iterator[Callable[[], bool]]:
+    """Gives `is_asked()`, true once after one or more SIGHUP; never where there is no such signal.
+
+    Only in the main thread; the handler is put back at the end.
+    """
+    asked = threading.Event()
+
+    def is_asked() -> bool:
+        if not asked.is_set():
+            return False
+        asked.clear()
+        return True
+
+    number = getattr(signal, "SIGHUP", None)
+    if number is None:
+        yield is_asked
+        return
+    before = signal.signal(number, lambda *_: asked.set())
+    try:
+        yield is_asked
+    finally:
+        signal.signal(number, before)

@@ -65,7 +65,7 @@ class Decoder:
         self._sensors = [_SensorInput(sensor, self.counters) for sensor in profile.sensors]
         self._routes: dict[int, list[_Route]] = {}
         accepted = _accepted_channels(profile, channels)
-        origin = None if map_origin_deg is None else MapOrigin(*map(math.radians, map_origin_deg))
+        origin = _map_origin(map_origin_deg)
         self._egos = [_EgoInput(ego, origin, self.counters) for ego in profile.ego]
         self._sources: list[_SensorInput | _EgoInput] = [*self._sensors, *self._egos]
         for source in self._sources:
@@ -81,6 +81,13 @@ class Decoder:
         As of the last `feed` or `poll`: silence shows only when time passes.
         """
         return tuple(source.health.report for source in self._sources)
+
+    def set_map_origin(self, map_origin_deg: tuple[float, float] | None) -> bool:
+        """Count latitudes and longitudes from another origin, see `__init__`; True if there are."""
+        geodetic = [ego for ego in self._egos if ego.is_geodetic]
+        for ego in geodetic:
+            ego.set_origin(_map_origin(map_origin_deg))
+        return bool(geodetic)
 
     def feed(self, message: can.Message, timestamp_s: float) -> list[Event]:
         """What this message completes; mostly nothing. The list is not to be changed."""
@@ -113,6 +120,10 @@ class Decoder:
         for ego in self._egos:
             ego.health.expire(now_s)
         return events
+
+
+def _map_origin(origin_deg: tuple[float, float] | None) -> MapOrigin | None:
+    return None if origin_deg is None else MapOrigin(*map(math.radians, origin_deg))
 
 
 class _Route:
@@ -227,6 +238,15 @@ class _EgoInput:
         self._decoder = EgoDecoder(profile, origin)
         self._counters = counters
         self.health = SourceHealth(profile.name, profile.silence_s, len(profile.parts))
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether it tells poses by latitude and longitude."""
+        return self._decoder.is_geodetic
+
+    def set_origin(self, origin: MapOrigin | None) -> None:
+        """The map has another origin from now on."""
+        self._decoder.set_origin(origin)
 
     def inputs(self) -> Iterator[tuple[Address, Take]]:
         """Which messages it takes, and what takes each."""

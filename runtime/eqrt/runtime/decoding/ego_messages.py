@@ -24,6 +24,15 @@ class EgoDecoder:
         self._values = [[_NAN] * len(part.columns) for part in profile.parts]
         self._arrived_s = [_NEVER] * len(profile.parts)
 
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether it tells poses by latitude and longitude."""
+        return "latitude" in self._profile.numbers
+
+    def set_origin(self, origin: MapOrigin | None) -> None:
+        """The map has another origin from now on, see `__init__`."""
+        self._origin = origin
+
     def add(self, part: int, data: Payload, timestamp_s: float) -> list[EgoMotion | EgoPose]:
         """Take a message; the last one of the group tells, together with what is still fresh."""
         profile = self._profile

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
+from eqrt.runtime.operation.realtime import stand_back
 from eqrt.runtime.prediction.predictor import Prediction
 
 STUCK_S = 2.0
@@ -65,6 +66,10 @@ class Direct:
             self.errors += 1
             raise Failed(str(error)) from error
 
+    def succeeded_by(self, model: Model) -> Direct:
+        """One for another model, which counts on."""
+        return _counting_on(self, Direct(model))
+
 
 class Watched:
     """Runs a model in a thread, and stops waiting when its time is over."""
@@ -100,6 +105,11 @@ class Watched:
         self._errors_in_a_row, self._pause_s = 0, STUCK_S
         return answer
 
+    def succeeded_by(self, model: Model) -> Watched:
+        """One for another model, which counts on; this one and its thread come to an end."""
+        self._worker.retire()
+        return _counting_on(self, Watched(model))
+
     def _replace_if_broken(self) -> None:
         """Have the model loaded anew, beside the loop; take it when it is there."""
         now_s = time.monotonic()
@@ -115,6 +125,14 @@ class Watched:
             self._next_restart_s = now_s + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
             self._successor = _Successor(self._model)
+
+
+Runner = TypeVar("Runner", Direct, Watched)
+
+
+def _counting_on(before: Runner, after: Runner) -> Runner:
+    after.errors, after.overruns, after.restarts = before.errors, before.overruns, before.restarts
+    return after
 
 
 class _Worker:
@@ -148,12 +166,20 @@ class _Worker:
         self._busy = False
         return self._answer
 
+    def retire(self) -> None:
+        """Nothing will be asked any more: the thread ends as soon as it can."""
+        self._scene = None
+        if self._asked.locked():  # else it has been rung for already
+            self._asked.release()
+
     def _work(self) -> None:
         while True:
             self._asked.acquire()
+            scene = self._scene
+            if scene is None:
+                return
             try:
-                assert self._scene is not None
-                self._answer = self._model.predict(self._scene)
+                self._answer = self._model.predict(scene)
             except Exception as error:
                 self._answer = error
             self._answered.release()
@@ -168,6 +194,7 @@ class _Successor:
         self._thread.start()
 
     def _load(self, model: Model) -> None:
+        stand_back()
         try:
             self.model = model.again()
         except (EqrtError, OSError):

@@ -26,7 +26,7 @@ _FILE_SECONDS = 600.0
 
 def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt serve` about recording."""
-    group = parser.add_argument_group("recording (docs/recording.md)")
+    group = parser.add_argument_group("recording", "docs/recording.md")
     group.add_argument(
         "--record",
         type=Path,

@@ -123,6 +123,14 @@ class EgoTracker:
         self._poses.append(timestamp_s, pose.map_from_ego)
         self._anchor(timestamp_s, pose.map_from_ego)
 
+    def leave_map(self) -> None:
+        """Poses to come are of another map frame: nothing told before can be compared with them.
+
+        Dead reckoning goes on, from nowhere in the map, until the next pose.
+        """
+        self._poses.clear()
+        self._begin_epoch(Pose2() if self._stationary else None)
+
     def map_from_ego(self, timestamp_s: float) -> Pose2 | None:
         """Where the ego is in the map, see `at`."""
         state = self.at(timestamp_s)

@@ -1,0 +1,99 @@
+"""`eqrt doctor`: is this machine fit for the service, and if not, what to do.
+
+It takes the options of `eqrt serve`, so that with the same --config it looks at what the service
+will use; what is not given is left out. Exit status: 0 nothing failed, 1 something did.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from eqrt.core.errors import EqrtError
+from eqrt.runtime import serve_options
+from eqrt.runtime.bus.channels import parse_channels
+from eqrt.runtime.decoding.profile import Profile
+from eqrt.runtime.doctor.bus import check_channel
+from eqrt.runtime.doctor.finding import Finding, Verdict, fail, has_failed, warn
+from eqrt.runtime.doctor.machine import check_machine
+from eqrt.runtime.doctor.parts import check_metrics, check_model, check_profile, check_tile
+from eqrt.runtime.operation.realtime import Realtime, parse_cpus
+from eqrt.runtime.settings import as_toml, namespace
+
+LISTEN_S = 2.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Those of `eqrt serve`, and the doctor's own."""
+    serve_options.add_arguments(parser)
+    parser.epilog = "example: eqrt doctor --config /etc/eqrt/eqrt.toml"
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    parser.add_argument(
+        "--listen",
+        type=float,
+        default=LISTEN_S,
+        metavar="S",
+        help=f"how long to listen on every channel (default: {LISTEN_S:g})",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look at everything, say what was found."""
+    settings = args.settings.resolve(args, is_complete=False)
+    if args.print_config:
+        print(as_toml(settings), end="")
+        return 0
+    asked = namespace(settings)
+    findings: list[Finding] = []
+    for finding in examine(asked, args.listen):
+        findings.append(finding)
+        if not args.json:
+            _say(finding)
+    if args.json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        counts = {verdict: [f.verdict for f in findings].count(verdict) for verdict in Verdict}
+        print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    return 1 if has_failed(findings) else 0
+
+
+def examine(asked: argparse.Namespace, listen_s: float) -> Iterator[Finding]:
+    """Finding by finding; `asked` are the options of `eqrt serve`."""
+    realtime = Realtime(
+        priority=asked.realtime_priority,
+        lock_memory=asked.realtime_lock_memory,
+        cpus=parse_cpus(asked.realtime_cpus) if asked.realtime_cpus else None,
+    )
+    yield from check_machine(realtime, Path(os.environ.get("STATE_DIRECTORY", ".")).absolute())
+    profile, finding = check_profile(asked.profile)
+    yield finding
+    yield check_model(asked.model)
+    yield check_tile(asked.tile)
+    yield check_metrics(asked.metrics, asked.metrics_anywhere)
+    yield from _channels(asked, profile, listen_s)
+
+
+def _channels(
+    asked: argparse.Namespace, profile: Profile | None, listen_s: float
+) -> Iterator[Finding]:
+    if not asked.can:
+        yield warn("channels", "none named", "name one with --can or in --config")
+        return
+    channels = {option.rpartition("=")[2] for option in asked.can}
+    if profile is not None:
+        try:
+            channels = set(parse_channels(asked.can, profile.roles).values())
+        except EqrtError as error:
+            yield fail("channels", str(error))
+    for channel in sorted(channels):
+        yield from check_channel(channel, asked.can_interface, asked.fd, profile, listen_s)
+
+
+def _say(finding: Finding) -> None:
+    print(f"{finding.verdict:<4}  {finding.check:<14} {finding.found}", flush=True)
+    if finding.advice:
+        print(f"{'':<21}-> {finding.advice}", flush=True)

@@ -1,0 +1,78 @@
+"""Checks of what the service is made of: profile, model, tile, the port for metrics."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from statistics import median
+
+from eqrt.core.errors import EqrtError
+from eqrt.runtime.decoding.profile import Profile, load_profile
+from eqrt.runtime.doctor.finding import Finding, fail, ok, warn
+from eqrt.runtime.operation.endpoint import Endpoint
+from eqrt.runtime.prediction.predictor import Predictor
+from eqrt.runtime.prediction.stored_vectors import read_vector, vector_folders
+from eqrt.runtime.prediction.tiles import load_tile
+
+_RUNS = 20
+_MOST_OF_A_STEP = 0.25  # for the model; the rest is for decoding, tracks, scene and sending
+
+
+def check_profile(name: str | None) -> tuple[Profile | None, Finding]:
+    """The profile, if it can be used."""
+    if name is None:
+        return None, warn("profile", "none named", "name one with --profile or in --config")
+    try:
+        profile = load_profile(name)
+    except EqrtError as error:
+        return None, fail("profile", str(error))
+    sensors = ", ".join(sensor.name for sensor in profile.sensors) or "no sensor"
+    ids = len(profile.arbitration_ids)
+    return profile, ok("profile", f"{profile.name}: {sensors}; {ids} CAN ids")
+
+
+def check_model(folder: Path) -> Finding:
+    """Checksum, test vector, and the time of a run."""
+    try:
+        predictor = Predictor.load(folder)
+        vector = read_vector(vector_folders(folder)[0], predictor.contract)
+    except EqrtError as error:
+        return fail("model", str(error))
+    spent_s = []
+    for _ in range(_RUNS):
+        begun_s = time.perf_counter()
+        predictor.predict(vector.scene)
+        spent_s.append(time.perf_counter() - begun_s)
+    targets, run_s = len(vector.scene.history), median(spent_s)
+    found = f"{predictor.contract.name} {predictor.model_id}: checksum and test vector are right, "
+    found += f"{1e3 * run_s:.1f} ms for a run of {targets} target{'s' if targets > 1 else ''}"
+    if run_s > _MOST_OF_A_STEP * predictor.contract.dt_s:
+        return warn("model", found, "too slow for this machine: predictions would come LATE")
+    return ok("model", found)
+
+
+def check_tile(path: Path | None) -> Finding:
+    """Whether it can be read, and what is in it."""
+    if path is None:
+        return ok("tile", "none: predictions will be made without a map")
+    try:
+        tile = load_tile(path)
+    except EqrtError as error:
+        return fail("tile", str(error))
+    info = tile.info
+    origin = info.origin_deg
+    where = f"origin {origin[0]:.5f}, {origin[1]:.5f}" if origin else "origin not on Earth"
+    return ok("tile", f"{info.name} {info.tile_id}: {tile.lane_map.num_lanes} lanes, {where}")
+
+
+def check_metrics(address: str | None, anywhere: bool) -> Finding:
+    """Whether the port is to be had."""
+    if address is None:
+        return ok("metrics", "not asked for")
+    try:
+        with Endpoint(address, anywhere=anywhere) as endpoint:
+            return ok("metrics", f"{endpoint.address} is free")
+    except EqrtError as error:
+        if isinstance(error.__cause__, OSError):
+            return warn("metrics", str(error), "is that the service itself, already running?")
+        return fail("metrics", str(error))

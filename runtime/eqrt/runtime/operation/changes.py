@@ -1,0 +1,102 @@
+"""What changed from one second to the next, told to the log in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from eqrt.runtime.operation.event_log import EventLog, Level
+from eqrt.runtime.output.forecasts import Mode
+from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
+
+MODES = {
+    Mode.RUN: "predicting, with map and pose",
+    Mode.NO_MAP: "predicting without a map",
+    Mode.NO_POSE: "no ego motion, or no pose in the map",
+    Mode.PARTIAL: "predicting from short histories",
+    Mode.LATE: "predictions take longer than a model step",
+    Mode.FALLBACK: "the model's predictions are refused; constant turn rate and velocity instead",
+    Mode.SILENT: "no input; everything said before is void",
+}
+"""A mode in words, for whoever reads the log."""
+_GOOD = {Mode.RUN, Mode.NO_MAP, Mode.PARTIAL}
+
+
+@dataclass(frozen=True, slots=True)
+class Counted:
+    """A count that somebody should hear of when it grows."""
+
+    event: str
+    text: str
+    """`{}` is by how much."""
+    level: Level = Level.WARNING
+
+
+COUNTED = {
+    "pipeline_fallbacks": Counted(
+        "fallback", "the model's prediction was refused for {} targets", Level.INFO
+    ),
+    "pipeline_shed": Counted("shed", "no time for the model on {} targets; physics instead"),
+    "pipeline_model_errors": Counted("model-error", "the model failed {} times"),
+    "pipeline_model_overruns": Counted(
+        "model-overrun", "the model did not answer in time, {} times"
+    ),
+    "pipeline_model_restarts": Counted("model-restart", "the model was loaded anew {} times"),
+    "decoder_bad_checksum": Counted("checksum", "{} messages with a wrong checksum"),
+    "ego_pose_jumps": Counted("pose-jump", "the ego's pose jumped {} times; tracks begin again"),
+    "tracks_dropped": Counted("tracks-full", "{} tracks were dropped: more objects than fit"),
+    "can_failed": Counted("can-full", "the bus did not take {} messages with predictions"),
+    "datagrams_failed": Counted("datagrams-failed", "{} datagrams could not be sent"),
+}
+"""By the name of the count in `ServiceStatus.totals`."""
+
+
+class Changes:
+    """Hears every status, compares it with the one before."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self._before: ServiceStatus | None = None
+
+    def __call__(self, status: ServiceStatus) -> None:
+        """Tell what is new."""
+        before, self._before = self._before, status
+        if status.mode != (before.mode if before else Mode.SILENT):
+            self._mode(Mode(status.mode))
+        buses = {bus.channel: bus for bus in before.buses} if before else {}
+        for bus in status.buses:
+            self._bus(buses.get(bus.channel), bus)
+        sources = {source.name: source for source in before.sources} if before else {}
+        for source in status.sources:
+            self._source(sources.get(source.name), source)
+        for name, counted in COUNTED.items():
+            more = status.totals.get(name, 0) - (before.totals.get(name, 0) if before else 0)
+            if more > 0:
+                text = counted.text.format(more)
+                self._log.say(counted.level, counted.event, text, count=more)
+
+    def _mode(self, mode: Mode) -> None:
+        level = Level.INFO if mode in _GOOD else Level.WARNING
+        self._log.say(
+            level, f"mode-{mode.name}", f"mode {mode.name}: {MODES[mode]}", mode=mode.name
+        )
+
+    def _bus(self, before: BusStatus | None, bus: BusStatus) -> None:
+        if bus.state != (before.state if before else "UP"):
+            level = Level.INFO if bus.state == "UP" else Level.ERROR
+            text = f"bus {bus.channel} is {bus.state}"
+            self._log.say(level, f"bus-{bus.channel}", text, channel=bus.channel, state=bus.state)
+        more = bus.overflow - (before.overflow if before else 0)
+        if more > 0:
+            text = f"bus {bus.channel}: {more} messages were lost, because they came too fast"
+            self._log.say(Level.WARNING, f"overflow-{bus.channel}", text, count=more)
+
+    def _source(self, before: SourceStatus | None, source: SourceStatus) -> None:
+        if before is not None and before.valid == source.valid:
+            return
+        if source.valid and before is None:
+            return
+        state = "is valid again" if source.valid else f"is not valid: {source.reason}"
+        level = Level.INFO if source.valid else Level.WARNING
+        self._log.say(
+            level, f"source-{source.name}", f"source {source.name} {state}", source=source.name
+        )

@@ -1,0 +1,176 @@
+"""`eqrt doctor`: what it finds good, what it finds bad, and what it says to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import can
+
+from drives import DRIVES, TILE, first_seconds
+from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.doctor.bus import Traffic, judge_link, judge_load, parse_link
+from eqrt.runtime.doctor.finding import Finding, Verdict
+from eqrt.runtime.operation.endpoint import Endpoint
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
+from processes import eqrt
+
+
+def examined(*arguments: str, status: int = 0) -> dict[str, Finding]:
+    """By check, what the command found."""
+    done = eqrt("doctor", "--json", "--listen", "1", *arguments)
+    assert (done.returncode, done.stderr) == (status, "")
+    found = [
+        Finding(**{**one, "verdict": Verdict(one["verdict"])}) for one in json.loads(done.stdout)
+    ]
+    assert len({finding.check for finding in found}) == len(found)
+    assert all(finding.found for finding in found)
+    assert all(finding.advice for finding in found if finding.verdict is Verdict.WARN)
+    return {finding.check: finding for finding in found}
+
+
+@contextmanager
+def radar_on(channel: str) -> Iterator[None]:
+    """The recorded radar, played again and again."""
+    lines = first_seconds(DRIVES["ars408"].log, 1.0).splitlines()
+    messages = [candump_message(line) for line in lines]
+    ended = threading.Event()
+
+    def play() -> None:
+        with open_bus(channel, LOCAL) as bus:
+            while not ended.is_set():
+                for message in messages:
+                    bus.send(message)
+                    time.sleep(0.002)
+                bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"x"))
+
+    player = threading.Thread(target=play)
+    player.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        player.join()
+
+
+def test_a_machine_without_can_is_examined_all_the_same() -> None:
+    found = examined()
+    for check in ("software", "processor", "clock", "disk", "model", "tile", "governor"):
+        assert found[check].verdict is not Verdict.FAIL
+    assert "checksum and test vector are right" in found["model"].found
+    assert "onnxruntime " in found["software"].found
+    assert found["profile"].verdict is found["channels"].verdict is Verdict.WARN
+
+
+def test_a_radar_that_sends_is_heard_and_known() -> None:
+    channel = f"doctor-{time.monotonic_ns()}"
+    options = ["--can", channel, "--can-interface", LOCAL]
+    with radar_on(channel):
+        found = examined(*options, "--profile", "ars408", "--tile", str(TILE))
+        other = examined(*options, "--profile", "generic")
+    assert found[f"channel {channel}"].verdict is Verdict.OK
+    traffic = found[f"traffic {channel}"]
+    assert traffic.verdict is Verdict.OK
+    assert 50 < float(traffic.found.split()[0]) < 600
+    ids = found[f"ids {channel}"]
+    assert (ids.verdict, ids.found.split(" of the profile's ")[0] > "0") == (Verdict.OK, True)
+    assert "lanes" in found["tile"].found
+    assert other[f"ids {channel}"].verdict is Verdict.WARN
+    assert "generic is not for what is on this channel" in other[f"ids {channel}"].advice
+
+
+def test_a_silent_channel_is_a_warning() -> None:
+    channel = f"doctor-{time.monotonic_ns()}"
+    found = examined("--can", channel, "--can-interface", LOCAL, "--profile", "ars408")
+    assert found[f"channel {channel}"].verdict is Verdict.OK
+    assert found[f"traffic {channel}"].verdict is Verdict.WARN
+    assert "nothing heard in 1 s" in found[f"traffic {channel}"].found
+
+
+def test_what_would_keep_the_service_from_starting_fails(tmp_path: Path) -> None:
+    """Each with the words that the service itself would use."""
+    model, tile = tmp_path / "model", tmp_path / "bad.tile"
+    shutil.copytree(DEFAULT_ARTIFACT, model)
+    content = bytearray((model / "model.onnx").read_bytes())
+    content[1000] ^= 1
+    (model / "model.onnx").write_bytes(content)
+    tile.write_bytes(TILE.read_bytes()[:-1])
+    found = examined(
+        "--can", "x=y", "--can-interface", "usbcan", "--profile", "ars408",
+        "--metrics", "1.2.3.4:5", "--tile", str(tile), "--model", str(model), status=1,
+    )  # fmt: skip
+    assert {name for name, one in found.items() if one.verdict is Verdict.FAIL} == {
+        "model", "tile", "channels", "channel y", "metrics",
+    }  # fmt: skip
+    assert "SHA-256" in found["model"].found
+    assert "there is no CAN interface 'usbcan'" in found["channel y"].found
+    assert "--metrics-anywhere" in found["metrics"].found
+
+
+def test_a_port_in_use_may_be_the_service_itself() -> None:
+    with Endpoint("127.0.0.1:0") as endpoint:
+        assert examined("--metrics", endpoint.address)["metrics"].verdict is Verdict.WARN
+    with closing(socket.create_server(("127.0.0.1", 0))) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    assert examined("--metrics", address)["metrics"].found == f"{address} is free"
+
+
+def test_the_report_is_for_people_unless_asked_otherwise(tmp_path: Path) -> None:
+    """From a configuration, as the service would read it; a profile that is missing fails."""
+    config = tmp_path / "eqrt.toml"
+    config.write_text('[serve]\nprofile = "no.toml"\n')
+    done = eqrt("doctor", "--config", str(config))
+    assert (done.returncode, done.stderr) == (1, "")
+    lines = done.stdout.splitlines()
+    assert any(line.startswith("FAIL  profile        there is no profile '") for line in lines)
+    assert str(tmp_path / "no.toml") in done.stdout
+    assert any(line.strip().startswith("-> ") for line in lines)
+    assert lines[-1].endswith(" 1 FAIL")
+
+
+# --- a real adapter, as `ip -json -details link show dev can0` tells of it
+
+
+LINK = """[{"ifname":"can0","flags":["NOARP","UP"],"mtu":72,"operstate":"UP","linkinfo":{
+"info_kind":"can","info_data":{"ctrlmode":["FD"],"state":"%s","restart_ms":0,
+"bittiming":{"bitrate":500000,"sample_point":"0.875"},
+"data_bittiming":{"bitrate":2000000,"sample_point":"0.750"}}}}]"""
+
+
+def test_state_and_bitrates_of_an_adapter_are_told() -> None:
+    well = judge_link("channel can0", parse_link(LINK % "ERROR-ACTIVE"), True)
+    assert (well.verdict, well.found) == (
+        Verdict.OK,
+        "open, CAN FD, can, 500000 bit/s, data 2000000 bit/s",
+    )
+    ill = judge_link("channel can0", parse_link(LINK % "BUS-OFF"), True)
+    assert ill.verdict is Verdict.FAIL
+    assert ill.found.endswith(", BUS-OFF")
+
+
+def test_a_bus_that_is_nearly_full_is_a_warning() -> None:
+    """111 bits a classic message of 8 bytes: 4,000 of them a second are 89 % of 500 kbit/s."""
+
+    def full(rate_hz: int) -> Finding:
+        traffic = Traffic(1.0)
+        for _ in range(rate_hz):
+            traffic.add(can.Message(arbitration_id=1, is_extended_id=False, data=bytes(8)))
+        return judge_load("traffic can0", traffic, 500_000)
+
+    assert (full(2000).verdict, full(4000).verdict) == (Verdict.OK, Verdict.WARN)
+    assert "89% of the bitrate" in full(4000).found
+
+
+def test_error_frames_are_a_warning() -> None:
+    traffic = Traffic(1.0)
+    traffic.add(can.Message(arbitration_id=1))
+    traffic.add(can.Message(arbitration_id=4, is_error_frame=True))
+    found = judge_load("traffic can0", traffic, None)
+    assert (found.verdict, "1 error frames" in found.found) == (Verdict.WARN, True)

@@ -1,0 +1,170 @@
+"""The log: forms, levels, rate, and which changes are told in which words."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import time
+from datetime import datetime
+
+import msgspec
+import pytest
+
+from drives import shipped_predictor
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.operation.changes import COUNTED, MODES, Changes
+from eqrt.runtime.operation.event_log import PER_MINUTE, EventLog, Level
+from eqrt.runtime.output.forecasts import Mode
+from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
+from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.status_book import StatusBook
+from no_channels import NoChannels
+
+
+class Heard:
+    """A log, what it wrote, and a clock that stands still until it is set."""
+
+    def __init__(self, form: str = "text", level: Level = Level.INFO, **more: str) -> None:
+        self.now_s = 100.0
+        self._stream = io.StringIO()
+        self.log = EventLog(
+            form, level, stream=self._stream, clock=lambda: self.now_s, environment=more
+        )
+
+    @property
+    def lines(self) -> list[str]:
+        """Without the time of the day."""
+        return [
+            re.sub(r"^\d\d:\d\d:\d\d ", "", line)
+            for line in self._stream.getvalue().split("\n")[:-1]
+        ]
+
+
+def test_an_event_is_a_line_for_people() -> None:
+    heard = Heard()
+    heard.log.say(Level.INFO, "reload", "reloaded", tile="x")
+    heard.log.say(Level.ERROR, "bus", "bus can0 is DOWN")
+    assert heard.lines == ["reloaded", "error: bus can0 is DOWN"]
+
+
+def test_an_event_is_an_object_for_machines() -> None:
+    heard = Heard("json")
+    heard.log.say(Level.WARNING, "bus", 'bus "can0"\nis DOWN', channel="can0")
+    (line,) = heard.lines
+    told = json.loads(line)
+    assert datetime.fromisoformat(told.pop("time")).tzinfo is not None
+    assert told == {
+        "level": "warning",
+        "event": "bus",
+        "text": 'bus "can0"\nis DOWN',
+        "channel": "can0",
+    }
+
+
+def test_under_systemd_lines_carry_their_level() -> None:
+    heard = Heard(JOURNAL_STREAM="8:1")
+    heard.log.say(Level.WARNING, "bus", "x")
+    heard.log.say(Level.INFO, "bus", "y")
+    assert heard.lines == ["<4>warning: x", "<6>y"]
+
+
+def test_events_below_the_level_are_not_said() -> None:
+    heard = Heard(level=Level.WARNING)
+    for level in Level:
+        heard.log.say(level, level.name, level.name)
+    assert heard.lines == ["error: ERROR", "warning: WARNING"]
+
+
+def test_an_event_is_said_a_few_times_a_minute_and_what_was_left_out_is_counted() -> None:
+    heard = Heard("json")
+    for _ in range(PER_MINUTE + 500):
+        heard.log.say(Level.INFO, "storm", "again")
+    heard.log.say(Level.INFO, "other", "something else")
+    heard.now_s += 59.9
+    heard.log.say(Level.INFO, "storm", "again")
+    heard.now_s += 0.2
+    heard.log.say(Level.INFO, "storm", "again")
+    heard.log.say(Level.INFO, "storm", "again")
+    told = [json.loads(line) for line in heard.lines]
+    assert [one["event"] for one in told] == ["storm"] * PER_MINUTE + ["other", "storm", "storm"]
+    assert told[-2]["left_out"] == 501
+    assert told[-2]["text"] == "again (501 more like it left out)"
+    assert "left_out" not in told[-1]
+
+
+def test_lines_that_are_always_said_are_not_counted() -> None:
+    heard = Heard()
+    for second in range(100):
+        heard.log.line("status", f"{second}")
+    assert len(heard.lines) == 100
+
+
+# --- changes
+
+
+@pytest.fixture(scope="module")
+def quiet() -> ServiceStatus:
+    """Of a service before its first cycle."""
+    pipeline = Pipeline(load_profile("ars408"), shipped_predictor())
+    made = StatusBook(pipeline, NoChannels(), []).close(time.monotonic() + 1.0)
+    return msgspec.structs.replace(made, sources=[])
+
+
+def told(*statuses: ServiceStatus) -> list[str]:
+    heard = Heard()
+    changes = Changes(heard.log)
+    for status in statuses:
+        changes(status)
+    return heard.lines
+
+
+def test_modes_are_told_when_they_change(quiet: ServiceStatus) -> None:
+    modes = [Mode.SILENT, Mode.NO_MAP, Mode.NO_MAP, Mode.LATE, Mode.SILENT]
+    statuses = [msgspec.structs.replace(quiet, mode=int(mode)) for mode in modes]
+    assert told(*statuses) == [
+        "mode NO_MAP: predicting without a map",
+        "warning: mode LATE: predictions take longer than a model step",
+        "warning: mode SILENT: no input; everything said before is void",
+    ]
+    assert set(MODES) == set(Mode)
+
+
+def test_buses_that_come_and_go_are_told(quiet: ServiceStatus) -> None:
+    def with_bus(state: str, overflow: int) -> ServiceStatus:
+        bus = BusStatus(channel="can0", state=state, since_s=1.0, overflow=overflow)
+        return msgspec.structs.replace(quiet, buses=[bus])
+
+    assert told(
+        with_bus("UP", 0), with_bus("BUS_OFF", 0), with_bus("UP", 5), with_bus("UP", 5)
+    ) == [
+        "error: bus can0 is BUS_OFF",
+        "bus can0 is UP",
+        "warning: bus can0: 5 messages were lost, because they came too fast",
+    ]
+
+
+def test_sources_that_become_invalid_are_told_with_the_reason(quiet: ServiceStatus) -> None:
+    def with_source(valid: bool) -> ServiceStatus:
+        source = SourceStatus(name="radar", valid=valid, reason="no data", since_s=1.0)
+        return msgspec.structs.replace(quiet, sources=[source])
+
+    assert told(with_source(True), with_source(False), with_source(False), with_source(True)) == [
+        "warning: source radar is not valid: no data",
+        "source radar is valid again",
+    ]
+
+
+def test_counts_are_told_by_how_much_they_grew(quiet: ServiceStatus) -> None:
+    def with_count(count: int) -> ServiceStatus:
+        return msgspec.structs.replace(quiet, totals=quiet.totals | {"can_failed": count})
+
+    assert told(with_count(0), with_count(3), with_count(3), with_count(10)) == [
+        "warning: the bus did not take 3 messages with predictions",
+        "warning: the bus did not take 7 messages with predictions",
+    ]
+
+
+def test_only_counts_that_exist_are_waited_for(quiet: ServiceStatus) -> None:
+    of_publishers = {"can_failed", "datagrams_failed"}
+    assert set(COUNTED) <= set(quiet.totals) | of_publishers
