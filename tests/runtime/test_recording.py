@@ -414,7 +414,7 @@ def test_a_writer_that_stands_still_costs_entries_but_never_time(tmp_path: Path)
     assert recording.lost > 100
     assert f"{recording.lost} steps were not recorded in time" in str(recording.remark)
     assert len(kept) + recording.lost >= 60 * 10 * 4
-    assert 5 < len(list(recording.forecasts())) < len(said)
+    assert 0 < len(list(recording.forecasts())) < len(said)
 
 
 # --- files that are not as they should be

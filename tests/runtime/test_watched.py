@@ -36,11 +36,11 @@ class Scripted:
     """A model whose runs do what they are told; when loaded anew, it is the next of the family."""
 
     contract = CONTRACT
-    model_id = "scripted"
 
     def __init__(self, *family: Callable[[int], None]) -> None:
         """`family`: what each generation does in its run number n."""
         self._family = family
+        self.model_id = "scripted"
         self.runs = 0
 
     def predict(self, scene: Scene) -> Prediction:
@@ -188,6 +188,31 @@ def test_a_model_that_cannot_be_loaded_any_more_is_tried_again_after_a_pause(
     assert model.restarts == 0
     assert len(tries) >= 2
     assert (np.diff(np.diff(tries)) > 0).all()  # the pauses grow
+
+
+def test_another_model_in_the_same_folder_is_not_taken_for_this_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Files that were replaced wait for a reload, which looks at the contract."""
+    tried = threading.Event()
+
+    class Replaced(Scripted):
+        def again(self) -> Scripted:
+            other = Scripted(well)
+            other.model_id = "other"
+            tried.set()
+            return other
+
+    monkeypatch.setattr(watched, "STUCK_S", 0.05)
+    model = Watched(Replaced(broken))
+    while not tried.is_set():
+        with pytest.raises(Failed):
+            model.run(scene(), 60.0)
+        time.sleep(0.01)
+    time.sleep(0.2)
+    with pytest.raises(Failed, match="no memory"):
+        model.run(scene(), 60.0)
+    assert model.restarts == 0
 
 
 def _eventually(ask: Callable[[], Prediction]) -> Prediction:

@@ -7,6 +7,7 @@ again and again, is loaded anew.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -195,10 +196,10 @@ class _Successor:
 
     def _load(self, model: Model) -> None:
         stand_back()
-        try:
-            self.model = model.again()
-        except (EqrtError, OSError):
-            self.model = None  # damaged meanwhile: tried again after a pause
+        with contextlib.suppress(EqrtError, OSError):  # damaged: tried again after a pause
+            loaded = model.again()
+            if loaded.model_id == model.model_id:  # another one is for `Pipeline.exchange`
+                self.model = loaded
 
     def is_loading(self) -> bool:
         return self._thread.is_alive()
