@@ -6,21 +6,24 @@ import contextlib
 import itertools
 import multiprocessing
 import os
+import shutil
 import signal
+import tempfile
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.synchronize import Event
-from typing import Any
+from pathlib import Path
 
 import can
 
-from drives import Car, object_list, shipped_predictor
+from drives import TILE, Car, object_list, shipped_predictor
 from eqrt.core.frames import Pose2
 from eqrt.core.scene import Scene
+from eqrt.core.tile import decode, encode
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
@@ -29,12 +32,13 @@ from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.datagrams import DatagramPublisher
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import Pipeline
-from eqrt.runtime.prediction.predictor import Prediction
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Prediction
+from eqrt.runtime.prediction.tiles import save_tile
 from eqrt.runtime.prediction.watched import Model
 from eqrt.runtime.service import Service
 from faults.outcome import Outcome
 from faults.promises import sound
-from processes import Heard, Serving
+from processes import EQRT, Heard, Serving
 
 CARS = tuple(
     Car(object_id=n, x_m=8.0 + 12.0 * n, y_m=3.5 * (n % 3), speed_mps=2.0) for n in range(8)
@@ -96,16 +100,39 @@ def _cycle(time_s: float, number: int) -> list[can.Message]:
 
 
 @dataclass(frozen=True)
+class Served:
+    """The service, and what of it a fault can get its hands on."""
+
+    pid: int
+    model: Hanging | None = None
+    """Where the service is in this process."""
+    folder: Path = Path()
+    """`model` and `map.tile`, where they are copies."""
+
+
+@dataclass(frozen=True)
 class World:
-    """What a fault can get its hands on."""
+    """All that a fault can get its hands on."""
 
     sensor: Sensor
     channel: str
     heard: Heard
-    pid: int
-    """The service's."""
-    model: Hanging | None = None
-    """Where the service is in this process."""
+    service: Served
+
+    @property
+    def pid(self) -> int:
+        """The service's."""
+        return self.service.pid
+
+    @property
+    def model(self) -> Hanging | None:
+        """The service's."""
+        return self.service.model
+
+    @property
+    def folder(self) -> Path:
+        """The service's files."""
+        return self.service.folder
 
 
 Fault = Callable[[World], AbstractContextManager[str]]
@@ -240,16 +267,114 @@ def model_hangs_for_good(world: World) -> Iterator[str]:
     yield "1 run"
 
 
+def _flip(path: Path) -> None:
+    """A bit in the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
 @contextlib.contextmanager
-def served_in_a_process(channel: str, heard: Heard) -> Iterator[tuple[int, None]]:
+def model_file_damaged(world: World) -> Iterator[str]:
+    """A bit of it is flipped, and the service told to load it."""
+    _flip(world.folder / "model/model.onnx")
+    os.kill(world.pid, signal.SIGHUP)
+    yield "1 bit, SIGHUP"
+
+
+@contextlib.contextmanager
+def tile_file_damaged(world: World) -> Iterator[str]:
+    """Likewise."""
+    _flip(world.folder / "map.tile")
+    os.kill(world.pid, signal.SIGHUP)
+    yield "1 bit, SIGHUP"
+
+
+@contextlib.contextmanager
+def tile_exchanged(world: World) -> Iterator[str]:
+    """Another one takes its place and it comes back, again and again."""
+    over, times = threading.Event(), 15
+    lane_map, info = decode(TILE.read_bytes(), "demo")
+    versions = [TILE.read_bytes(), encode(lane_map, replace(info, name="other"))]
+
+    def exchange() -> None:
+        for number in range(times):
+            save_tile(world.folder / "map.tile", versions[number % 2])
+            os.kill(world.pid, signal.SIGHUP)
+            if over.wait(0.2):
+                return
+
+    thread = threading.Thread(target=exchange)
+    thread.start()
+    yield f"{times} times, SIGHUP"
+    over.set()
+    thread.join()
+    seen = {forecast.tile_id for forecast in world.heard.forecasts}
+    assert len(seen - {""}) == 2, "the other tile was never used"
+
+
+@contextlib.contextmanager
+def recorder_killed(world: World) -> Iterator[str]:
+    """The process that writes the recording."""
+    children = Path(f"/proc/{world.pid}/task/{world.pid}/children").read_text(encoding="utf-8")
+    for child in children.split():
+        os.kill(int(child), signal.SIGKILL)
+    yield "1 SIGKILL"
+
+
+@contextlib.contextmanager
+def disk_fills_up(world: World) -> Iterator[str]:
+    """The recording has a file system of its own, which it fills by itself."""
+    yield "256 kB of room"
+    assert world.heard.statuses[-1].totals["recording_ended"] == 1, "there was room enough"
+
+
+@contextlib.contextmanager
+def served_in_a_process(channel: str, heard: Heard) -> Iterator[Served]:
     """`eqrt serve` as it is."""
-    options = ["--can", channel, "--can-interface", LOCAL, "--profile", "generic"]
-    with Serving(*options, "--datagrams", heard.address, "--quiet") as service:
-        yield service.pid, None
+    with Serving(*_options(channel, heard)) as service:
+        yield Served(service.pid)
 
 
 @contextlib.contextmanager
-def served_in_a_thread(channel: str, heard: Heard) -> Iterator[tuple[int, Hanging]]:
+def served_from_files(channel: str, heard: Heard) -> Iterator[Served]:
+    """With a model and a tile that are ours to change."""
+    with tempfile.TemporaryDirectory(prefix="eqrt-faults-") as name:
+        folder = Path(name)
+        shutil.copytree(DEFAULT_ARTIFACT, folder / "model")
+        shutil.copy(TILE, folder / "map.tile")
+        files = ["--model", str(folder / "model"), "--tile", str(folder / "map.tile")]
+        with Serving(*_options(channel, heard), *files) as service:
+            yield Served(service.pid, folder=folder)
+
+
+@contextlib.contextmanager
+def served_and_recorded(channel: str, heard: Heard) -> Iterator[Served]:
+    """Into a folder."""
+    with tempfile.TemporaryDirectory(prefix="eqrt-faults-") as folder:
+        record = ["--record", folder, "--record-keep-free", "1K"]
+        with Serving(*_options(channel, heard), *record) as service:
+            yield Served(service.pid)
+
+
+@contextlib.contextmanager
+def served_and_recorded_into_little_room(channel: str, heard: Heard) -> Iterator[Served]:
+    """Into a file system of 256 kB, in a mount namespace of the service's own."""
+    with tempfile.TemporaryDirectory(prefix="eqrt-faults-") as folder:
+        mount = f'mount -t tmpfs -o size=256k none {folder} && exec "$@"'
+        record = ["--record", folder, "--record-keep-free", "1K"]
+        before = ["unshare", "--mount", "--map-root-user", "sh", "-c", mount, "sh"]
+        with Serving(*_options(channel, heard), *record, command=[*before, *EQRT]) as service:
+            yield Served(service.pid)
+
+
+def _options(channel: str, heard: Heard) -> list[str]:
+    bus = ["--can", channel, "--can-interface", LOCAL, "--profile", "generic"]
+    return [*bus, "--datagrams", heard.address, "--quiet"]
+
+
+@contextlib.contextmanager
+def served_in_a_thread(channel: str, heard: Heard) -> Iterator[Served]:
     """The same loop around a model that we have in hand."""
     model, over = Hanging(), threading.Event()
     profile = load_profile("generic")
@@ -261,13 +386,13 @@ def served_in_a_thread(channel: str, heard: Heard) -> Iterator[tuple[int, Hangin
         service = Service(pipeline, receiver, [publisher])
         thread = threading.Thread(target=service.run, args=(over.is_set,))
         thread.start()
-        yield os.getpid(), model
+        yield Served(os.getpid(), model=model)
         over.set()
         model.back.set()
         thread.join()
 
 
-FAULTS: dict[str, tuple[float, Fault, Callable[..., AbstractContextManager[tuple[int, Any]]]]] = {
+FAULTS: dict[str, tuple[float, Fault, Callable[[str, Heard], AbstractContextManager[Served]]]] = {
     "none": (3.0, no_fault, served_in_a_process),
     "the sensor falls silent for 3 s": (3.0, sensor_silent, served_in_a_process),
     "the service stands still for 0.5 s": (0.5, service_stopped, served_in_a_process),
@@ -277,6 +402,11 @@ FAULTS: dict[str, tuple[float, Fault, Callable[..., AbstractContextManager[tuple
     "listeners on the bus are killed for 3 s": (3.0, other_listener_killed, served_in_a_process),
     "the model hangs for 1 s": (1.0, model_hangs, served_in_a_thread),
     "the model hangs for good": (1.0, model_hangs_for_good, served_in_a_thread),
+    "the model file is damaged": (2.0, model_file_damaged, served_from_files),
+    "the tile file is damaged": (2.0, tile_file_damaged, served_from_files),
+    "the tile is exchanged under way": (3.0, tile_exchanged, served_from_files),
+    "the recorder is killed": (2.0, recorder_killed, served_and_recorded),
+    "the disk fills up": (6.0, disk_fills_up, served_and_recorded_into_little_room),
 }
 
 
@@ -292,23 +422,23 @@ def process_fault(name: str) -> Outcome:
     channel = next(CHANNELS)
     with (
         Heard(channel, []) as heard,
-        served(channel, heard) as (pid, model),
+        served(channel, heard) as service,
         Sensor(channel) as sensor,
     ):
-        return _outcome(name, seconds, fault, World(sensor, channel, heard, pid, model))
+        return _outcome(name, seconds, fault, World(sensor, channel, heard, service))
 
 
 def _outcome(name: str, seconds: float, fault: Fault, world: World) -> Outcome:
     _wait_until(lambda: _steady_since(world.heard) is not None, PATIENCE_S)
     before = len(world.heard.forecasts)
-    with fault(world) as injected:
-        time.sleep(seconds)
-    over_s = time.monotonic()
-    during = len(world.heard.forecasts)
-    _wait_until(lambda: _steady_since(world.heard, during) is not None, PATIENCE_S)
-    since_s = _steady_since(world.heard, during)
-    broken = ""
+    injected = broken = ""
+    over_s, during, since_s = time.monotonic(), before, None
     try:
+        with fault(world) as injected:
+            time.sleep(seconds)
+        over_s, during = time.monotonic(), len(world.heard.forecasts)
+        _wait_until(lambda: _steady_since(world.heard, during) is not None, PATIENCE_S)
+        since_s = _steady_since(world.heard, during)
         _keep_promises(world.heard.forecasts)
     except AssertionError as error:
         broken = str(error).splitlines()[0]
@@ -334,7 +464,11 @@ def _steady_since(heard: Heard, first: int = 0) -> float | None:
     since_s = None
     for forecast in heard.forecasts[first:]:
         is_full = set(forecast.agent_mode.tolist()) == {Mode.RUN}
-        if not (is_full and forecast.num_targets == len(CARS) and forecast.mode is Mode.NO_MAP):
+        if not (
+            is_full
+            and forecast.num_targets == len(CARS)
+            and forecast.mode in (Mode.RUN, Mode.NO_MAP)
+        ):
             since_s = None
         elif since_s is None:
             since_s = forecast.made_s
