@@ -10,4 +10,4 @@ ALL: dict[str, Target] = {
     for module in (decoding, logs, profiles, tiles, artifacts, words)
     for target in module.TARGETS
 }
-"""By name. `serve`'s configuration file belongs into `words` once there is one."""
+"""By name."""

@@ -7,12 +7,13 @@ import io
 import math
 from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from eqrt.cli import COMMANDS, Parser
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import ConfigError, UsageError
 from eqrt.runtime import play, replay, serve, tile_command
 from eqrt.runtime.bench import command as bench_command
 from eqrt.runtime.bus.channels import parse_channels
@@ -20,10 +21,12 @@ from eqrt.runtime.demo import command as demo_command
 from eqrt.runtime.output.datagrams import decode_datagram, encode_datagrams
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.play import parse_routes
+from eqrt.runtime.settings import Setting, as_toml
 from eqrt.runtime.verify import command as verify_command
 from eqrt.runtime.verify import info
 from forecast_sets import many, nobody
-from fuzz.target import Target, assert_one_line
+from fuzz.target import Target, assert_one_line, written
+from source_tree import ROOT
 
 _COMMANDS = (
     serve,
@@ -52,6 +55,32 @@ def read_options(data: bytes) -> None:
     except SystemExit as end:
         if end.code != _HELP:
             raise
+
+
+def read_configuration(data: bytes) -> None:
+    """One that is taken can be printed, and what is printed says the same."""
+    try:
+        settings = _settings_of(written("fuzzed.toml", data))
+        printed = _settings_of(written("printed.toml", as_toml(settings).encode()))
+    except ConfigError as error:
+        assert_one_line(error)
+        return
+    assert {s.option.flag: repr(s.value) for s in printed} == {
+        s.option.flag: repr(s.value) for s in settings
+    }
+
+
+def _settings_of(path: Path) -> list[Setting]:
+    given = _serve_parser().parse_args(["--config", str(path)])
+    resolved: list[Setting] = given.settings.resolve(given, is_complete=False)
+    return resolved
+
+
+@cache
+def _serve_parser() -> Parser:
+    parser = Parser(prog="eqrt serve", allow_abbrev=False)
+    serve.add_arguments(parser)
+    return parser
 
 
 def read_channels(data: bytes) -> None:
@@ -136,6 +165,12 @@ def _options() -> Iterator[bytes]:
         yield bytes([which]) + line.replace(" ", "\n").encode()
 
 
+def _configurations() -> Iterator[bytes]:
+    yield (ROOT / "deploy" / "eqrt.toml").read_bytes()
+    yield b'[serve]\ncan = ["radar=can0"]\nprofile = "ars408"\nquiet = true\nout_id = "0x6e0"\n'
+    yield b'[recording]\ndir = "a"\nlimit = "20G"\n[realtime]\npriority = 10\ncpus = "0-1"\n'
+
+
 def _channels() -> Iterator[bytes]:
     yield b"vcan0"
     yield b"radar=can1\ncar=can0"
@@ -152,6 +187,12 @@ TARGETS = [
         run=read_options,
         seeds=_options,
         words=("--", *(f"--{x}" for x in COMMANDS)),
+    ),
+    Target(
+        name="configuration",
+        run=read_configuration,
+        seeds=_configurations,
+        words=("[serve]", "[recording]", "[realtime]", "can = [", " = true", "profile = "),
     ),
     Target(
         name="channels", run=read_channels, seeds=_channels, words=("radar=", "car="), max_bytes=256

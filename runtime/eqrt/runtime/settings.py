@@ -17,8 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from eqrt.core.errors import ConfigError, UsageError
+from eqrt.core.files import read_at_most
 
 DEFAULT, COMMAND_LINE = "default", "command line"
+MAX_FILE_BYTES = 1 << 18
+"""A hundred times the longest file that makes sense."""
 _NO_KEYS = frozenset({"help", "config", "print_config"})  # they are about the file
 _OPTIONS_GROUP = "options"  # argparse's name for what is in no group
 
@@ -191,11 +194,11 @@ class _File:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._text = path.read_text(encoding="utf-8")
+            self._text = read_at_most(MAX_FILE_BYTES, path).decode("utf-8")
             self._values = tomllib.loads(self._text)
         except OSError as error:
             raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from error
-        except ValueError as error:  # neither UTF-8 nor TOML
+        except (ValueError, RecursionError) as error:  # neither UTF-8 nor TOML, or far too deep
             raise ConfigError(f"the configuration {path} is not TOML: {error}") from error
 
     def settings(self, options: Sequence[Option]) -> dict[str, Setting]:
