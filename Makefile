@@ -24,7 +24,7 @@ demo: $(RUNTIME_VENV)/.installed-view ## see it work: recorded traffic over CAN,
 	@$(RUNTIME_VENV)/bin/eqrt demo
 
 test: $(VENV)/.installed test-runtime ## run all tests: without torch what ships to the car, then the rest
-	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
+	$(VENV)/bin/python -m pytest $(PYTEST_ARGS) --ignore=tests/core --ignore=tests/runtime
 
 test-runtime: $(RUNTIME_VENV)/.installed-tests ## run the tests of what ships to the car, without torch
 	$(RUNTIME_VENV)/bin/python -m pytest $(PYTEST_ARGS) tests/core tests/runtime

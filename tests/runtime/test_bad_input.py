@@ -123,7 +123,11 @@ CASES: list[tuple[str, int, str]] = [  # command line, status, what is said
     (f"{SERVE} --tile .", 1, r"the tile cannot be read \(Is a directory\)"),
     ("tile info cut.tile", 1, r"cut\.tile: the tile is cut short"),
     # Where predictions go
-    (f"{SERVE} --out-can none", 2, r"--out-can none and no --datagrams: .* go nowhere"),
+    (
+        f"{SERVE} --out-can none",
+        2,
+        r"--out-can none, no --datagrams, no --record: .* would go nowhere",
+    ),
     (f"{SERVE} --datagrams here", 2, r"cannot send datagrams to 'here' .*give HOST:PORT, such as"),
     (
         f"{SERVE} --datagrams 127.0.0.1:99999",
@@ -144,7 +148,7 @@ CASES: list[tuple[str, int, str]] = [  # command line, status, what is said
     (
         "replay . --profile ars408 --out -",
         1,
-        r"the log \. is not a file; give the path of a recorded",
+        r"\.: there is no recording of eqrt in it \(eqrt-\*\.mcap\); give a recorded CAN log or",
     ),
     (
         "replay drive.mf4 --profile ars408 --out -",

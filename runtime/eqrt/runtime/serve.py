@@ -180,7 +180,9 @@ def _publishers(
         bus = receiver.connection(out)
         publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
     elif not args.datagrams and not args.record:
-        raise UsageError("--out-can none, no --datagrams, no --record: predictions go nowhere")
+        raise UsageError(
+            "--out-can none, no --datagrams, no --record: the predictions would go nowhere"
+        )
     if args.datagrams:
         publishers.append(stack.enter_context(DatagramPublisher(args.datagrams)))
     return publishers

@@ -167,7 +167,10 @@ def read_recordings(path: Path) -> list[Recording]:
     for file in recordings_in(path):
         runs.setdefault(run_of(file), []).append(file)
     if not runs:
-        raise LogError(f"{path}: there is no recording of eqrt in it (eqrt-*{SUFFIX})")
+        raise LogError(
+            f"{path}: there is no recording of eqrt in it (eqrt-*{SUFFIX}); give a recorded CAN "
+            "log or a folder of `eqrt serve --record`"
+        )
     return [Recording(files) for files in runs.values()]
 
 
