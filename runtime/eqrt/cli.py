@@ -35,6 +35,10 @@ COMMANDS = {
         "eqrt.export.bridges.convert",
         "turn a recording into Foxglove, ROS 2, candump or JSON files (extra: bridges)",
     ),
+    "bridge": (
+        "eqrt.export.bridges.bridge",
+        "pass predictions on to PlotJuggler or zenoh while the service runs (extra: bridges)",
+    ),
     "view": (
         "eqrt.runtime.view.command",
         "watch the service, or a recorded file, in a browser (extra: view)",
@@ -82,6 +86,7 @@ EXTRA_OF = {  # third-party module -> the extra that brings it
     "google": "bridges",
     "rosbags": "bridges",
     "websockets": "view",
+    "zenoh": "bridges",
 }
 _EXTRA_OF_COMMAND = {"view": "view", "top": "view"}  # for packages that come with several extras
 

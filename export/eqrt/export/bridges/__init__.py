@@ -1,1 +1,1 @@
-"""Recordings for other programs: Foxglove, PlotJuggler, ROS 2. None of it runs in the service."""
+"""For other programs: recordings, and a running service. None of it runs in the service."""

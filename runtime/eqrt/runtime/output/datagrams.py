@@ -60,17 +60,18 @@ class DatagramPublisher:
         if not self._addresses:
             return
         for payload in encode_datagrams(forecasts):
-            self._send(payload)
+            self.send(payload)
 
     def report(self, status: ServiceStatus) -> None:
         """Send the service's own state."""
-        self._send(_ENCODER.encode(_StatusWire(version=FORMAT_VERSION, status=status)))
+        self.send(_ENCODER.encode(_StatusWire(version=FORMAT_VERSION, status=status)))
 
     def counts(self) -> dict[str, int]:
         """Since the start, by name."""
         return {"datagrams_sent": self.sent, "datagrams_failed": self.failed}
 
-    def _send(self, payload: bytes) -> None:
+    def send(self, payload: bytes) -> None:
+        """Send bytes as they are; what the network does not take is counted."""
         for family, address in self._addresses:
             try:
                 self._sockets[family].sendto(payload, address)

@@ -20,7 +20,8 @@ from pathlib import Path
 from eqrt.core.errors import UsageError
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS
 from eqrt.runtime.view.guests import is_loopback
-from eqrt.runtime.view.live import Ear, Live, follow, listen
+from eqrt.runtime.view.hearing import Ear, listen
+from eqrt.runtime.view.live import Live, follow
 from eqrt.runtime.view.playback import Playback
 from eqrt.runtime.view.recorded import READERS, read_records
 from eqrt.runtime.view.server import ViewServer

@@ -10,78 +10,14 @@ from pathlib import Path
 
 import msgspec
 
-from eqrt.core.errors import UsageError
-from eqrt.runtime.output.datagrams import Datagram, decode_datagram
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.view.joining import Joiner
+from eqrt.runtime.view.hearing import Ear
 from eqrt.runtime.view.server import SERVER_ID, Outbox, ViewServer, Wanted
 from eqrt.runtime.view.updates import encode_status, encode_text
 from eqrt.runtime.view.watch import Lanes, LastMinute, Watch
 
-_RECEIVE_BYTES = 1 << 20  # 5 s of 64 objects with one mode: what comes while the viewer is busy
-_LARGEST_BYTES = 65_535
 _STATUSES = 61  # a minute
-
-Record = ForecastSet | ServiceStatus
-
-
-def listen(address: str) -> socket.socket:
-    """A socket that hears what `eqrt serve --datagrams ADDRESS` says. Raises UsageError."""
-    host, _, port = address.rpartition(":")
-    try:
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
-        family, _, _, _, target = found[0]
-        receiver = socket.socket(family, socket.SOCK_DGRAM)
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"cannot listen at {address!r} ({error}); give HOST:PORT, such as 127.0.0.1:47310"
-        ) from error
-    receiver.setblocking(False)
-    receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
-    try:
-        receiver.bind(target)
-    except OSError as error:
-        receiver.close()
-        raise UsageError(
-            f"cannot listen at {address} ({error.strerror}); if another viewer does, give both "
-            "the service and this one a second address: --datagrams HOST:PORT"
-        ) from error
-    return receiver
-
-
-class Ear:
-    """Hears datagrams, gives whole records."""
-
-    def __init__(self, receiver: socket.socket) -> None:
-        self._receiver = receiver
-        self._joiner = Joiner()
-        self.trouble = ""
-        """What came that could not be read."""
-
-    @property
-    def lost_cycles(self) -> int:
-        """That were sent and did not come whole."""
-        return self._joiner.lost_cycles
-
-    def records(self) -> Iterator[Record]:
-        """What has come since; never waits."""
-        while True:
-            try:
-                payload = self._receiver.recv(_LARGEST_BYTES)
-            except (BlockingIOError, InterruptedError):
-                return
-            try:
-                heard = decode_datagram(payload)
-            except ValueError as error:
-                self.trouble = str(error)
-                continue
-            self.trouble = ""
-            if isinstance(heard, Datagram):
-                if (whole := self._joiner.add(heard)) is not None:
-                    yield whole
-            else:
-                yield heard
 
 
 class Live:

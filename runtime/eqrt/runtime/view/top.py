@@ -23,9 +23,9 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.signals import until_told_to_stop
 from eqrt.runtime.view.command import add_datagram_argument
+from eqrt.runtime.view.hearing import Ear, Record, listen
 from eqrt.runtime.view.hindsight import Ghosts, Score
 from eqrt.runtime.view.keyboard import Keyboard
-from eqrt.runtime.view.live import Ear, Record, listen
 from eqrt.runtime.view.updates import ego_pose
 from eqrt.runtime.view.watch import Watch
 from eqrt.runtime.view.words import (
