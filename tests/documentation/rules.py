@@ -38,6 +38,7 @@ NOT_RUN = (
     NotRun(r"benchmarks", r"eqrt bench --json ", "start-budget.md has the same"),
     NotRun(r"benchmarks", r"eqrt bench --compare", "a minute; test_side_by_side.py runs it"),
     NotRun(r"reliability", r"PYTHONPATH=", "load over minutes, and SocketCAN: tests/socketcan"),
+    NotRun(r"bridges", r"eqrt bridge ", "runs until it is told to end; see test_live_bridges.py"),
     NotRun(r"training", r"torchrun ", "tests/training/test_ranks.py runs two processes"),
     NotRun(r"model", r"eqrt simulate acosta", "SUMO's Bologna scenarios are not in the repository"),
     NotRun(r"evaluation", r"eqrt eval .* --scheduler ", "needs a cluster; see test_evaluation.py"),

@@ -19,9 +19,9 @@ import pytest
 import zenoh
 
 from eqrt.cli import main
-from eqrt.export.bridges.to_plotjuggler import encode_cycle, encode_status
+from eqrt.export.bridges.bridge import DEFAULT_LISTEN
+from eqrt.export.bridges.to_plotjuggler import MAX_BYTES, encode_cycle, encode_status
 from eqrt.runtime.output.datagrams import (
-    MAX_BYTES,
     Datagram,
     DatagramPublisher,
     decode_datagram,
@@ -170,7 +170,7 @@ def test_left_and_right_are_those_of_the_ego_vehicle() -> None:
 
 
 def test_a_large_cycle_is_split_by_tracks_each_with_its_time() -> None:
-    forecasts = many(400)
+    forecasts = many(12)
     datagrams = [series(payload) for payload in encode_cycle(forecasts)]
     assert len(datagrams) == 3
     assert [one["timestamp"] for one in datagrams] == [50.0, 50.0, 50.0]
@@ -285,12 +285,34 @@ def test_zenoh_connects_where_it_is_told() -> None:
 
 def test_nothing_leaves_the_machine_unless_it_is_told_to() -> None:
     """The bridge's sockets, as the kernel lists them: UDP for the datagrams, one port for zenoh."""
+    assert DEFAULT_LISTEN.startswith("tcp/127.0.0.1:")
     endpoint = free_endpoint()
     with bridge("--to", "zenoh", "--listen", endpoint) as (process, datagrams):
         assert sockets_of(process.pid, "udp") == {datagrams}
         assert sockets_of(process.pid, "udp6") == set()
         assert sockets_of(process.pid, "tcp") == {endpoint.removeprefix("tcp/")}
         assert sockets_of(process.pid, "tcp6") == set()
+
+
+def test_who_may_listen_from_outside_is_said() -> None:
+    port = free_endpoint().rpartition(":")[2]
+    with bridge("--to", "zenoh", "--listen", f"tcp/0.0.0.0:{port}") as (process, _):
+        _, _, stderr = ended(process, signal.SIGTERM)
+    assert stderr == "eqrt bridge: everybody who can reach 0.0.0.0 can listen\n"
+
+
+def test_a_configuration_of_zenohs_own_is_used(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    file = tmp_path / "session.json5"
+    scouting = "scouting: {multicast: {enabled: false}}"
+    file.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {scouting}}}')
+    with (
+        bridge("--to", "zenoh", "--zenoh-config", str(file)) as (process, datagrams),
+        DatagramPublisher([datagrams]) as service,
+        subscriber(endpoint) as newest,
+    ):
+        assert set(heard_of(service, newest, nobody())) == {"eqrt/forecasts", "eqrt/status"}
+        assert ended(process, signal.SIGTERM)[0] == 0
 
 
 def sockets_of(pid: int, protocol: str) -> set[str]:

@@ -18,6 +18,7 @@ from eqrt.core.errors import UsageError
 from eqrt.export.bridges.to_plotjuggler import PLOTJUGGLER_ADDRESS, ToPlotJuggler
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS
 from eqrt.runtime.signals import until_told_to_stop
+from eqrt.runtime.view.guests import is_loopback
 from eqrt.runtime.view.hearing import Ear, listen
 
 DEFAULT_KEY = "eqrt"
@@ -142,6 +143,10 @@ def _zenoh(args: argparse.Namespace) -> AbstractContextManager[Bridge]:
     listens = args.listen
     if listens is None and args.zenoh_config is None:
         listens = [] if args.connect else [DEFAULT_LISTEN]
+    for endpoint in listens or []:
+        host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+        if host and not is_loopback(host):
+            print(f"eqrt bridge: everybody who can reach {host} can listen", file=sys.stderr)
     config = session_config(file=args.zenoh_config, listens=listens, connects=args.connect)
     return ToZenoh(config, key=DEFAULT_KEY if args.key is None else args.key)
 

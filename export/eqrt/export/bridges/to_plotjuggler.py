@@ -24,8 +24,10 @@ from eqrt.runtime.view.words import DROPS
 
 PLOTJUGGLER_ADDRESS = "127.0.0.1:9870"
 """Where PlotJuggler's UDP server listens unless told otherwise."""
-TRACKS_PER_DATAGRAM = 150
-"""A track takes less than 300 bytes, a datagram may have 60,000."""
+MAX_BYTES = 1_400
+"""Fits one Ethernet frame, and the 2,048 bytes at which some of PlotJuggler's versions cut off."""
+TRACKS_PER_DATAGRAM = 5
+"""Of at most 225 bytes each; the cycle's own numbers take as much."""
 PREDICTED_S = (1, 2, 3)
 _ENCODER = msgspec.msgpack.Encoder()
 
