@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
+import select
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -267,6 +270,34 @@ def test_zenoh_has_datagrams_as_they_are_and_status_as_json() -> None:
     assert json.loads(status.payload.to_string())["totals"] == STATUS.totals
     assert (status_code, stderr) == (0, "")
     assert stdout.startswith("eqrt bridge: ended; ")
+
+
+def test_the_pages_example_hears_the_bridge() -> None:
+    """docs/bridges.md, at another endpoint."""
+    endpoint = free_endpoint()
+    found = re.search(r"```python\n(.*?)```", (ROOT / "docs/bridges.md").read_text(), re.DOTALL)
+    assert found is not None
+    example = found[1].replace("tcp/127.0.0.1:7447", endpoint)
+    assert endpoint in example
+    with (
+        bridge("--to", "zenoh", "--listen", endpoint) as (_, datagrams),
+        DatagramPublisher([datagrams]) as service,
+        subprocess.Popen(
+            [sys.executable, "-u", "-c", example],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment(),
+        ) as reader,
+    ):
+        assert reader.stdout is not None
+        try:
+            end_s = time.monotonic() + PATIENCE_S
+            while not select.select([reader.stdout], [], [], 0.05)[0]:
+                assert time.monotonic() < end_s
+                service.publish(many(5))
+            assert reader.stdout.readline() == "5\n"
+        finally:
+            reader.kill()
 
 
 def test_zenoh_connects_where_it_is_told() -> None:
