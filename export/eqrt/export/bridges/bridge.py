@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         listen(args.datagrams) as receiver,
         _KINDS[args.to](args) as bridge,
     ):
-        ear, said = Ear(receiver), ""
+        ear, said = Ear(receiver), 0
         print(
             f"eqrt bridge: from {args.datagrams} to {bridge.where}  Ctrl-C ends",
             flush=True,
@@ -120,10 +120,9 @@ def run(args: argparse.Namespace) -> int:
         while not should_stop():
             select.select([receiver], [], [], _LOOK_S)
             bridge.pass_on(ear)
-            if ear.trouble != said:
-                said = ear.trouble
-                if said:
-                    print(f"eqrt bridge: not passed on: {said}", file=sys.stderr, flush=True)
+            for reason in list(ear.refused)[said:]:
+                print(f"eqrt bridge: not passed on: {reason}", file=sys.stderr, flush=True)
+            said = len(ear.refused)
     print(f"eqrt bridge: ended; {bridge.told()}")
     return 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections import Counter
 from collections.abc import Iterator
 
 from eqrt.core.errors import UsageError
@@ -13,6 +14,7 @@ from eqrt.runtime.view.joining import Joiner
 
 _RECEIVE_BYTES = 1 << 20  # 5 s of 64 objects with one mode: what comes while the viewer is busy
 _LARGEST_BYTES = 65_535
+_MOST_REASONS = 16  # a stranger may give any number of them
 
 Record = ForecastSet | ServiceStatus
 
@@ -48,7 +50,9 @@ class Ear:
         self._receiver = receiver
         self._joiner = Joiner()
         self.trouble = ""
-        """What came that could not be read."""
+        """Why what came last could not be read; empty if it could."""
+        self.refused: Counter[str] = Counter()
+        """Since the start: why datagrams could not be read, and how many."""
 
     @property
     def lost_cycles(self) -> int:
@@ -74,6 +78,8 @@ class Ear:
                 heard = decode_datagram(payload)
             except ValueError as error:
                 self.trouble = str(error)
+                if self.trouble in self.refused or len(self.refused) < _MOST_REASONS:
+                    self.refused[self.trouble] += 1
                 continue
             self.trouble = ""
             yield payload, heard
