@@ -7,14 +7,17 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 SOURCE_ROOTS = ("runtime", "training", "export")
 WORKSTATION_PACKAGES = {
+    "foxglove_schemas_protobuf",
     "lanelet2",
     "matplotlib",
     "onnx",
     "onnxscript",
     "rich",
+    "rosbags",
     "safetensors",
     "torch",
     "websockets",
+    "zenoh",
 }
 """What the car must do without."""
 VIEWER = "eqrt.runtime.view"

@@ -39,6 +39,12 @@ NOT_RUN = (
     NotRun(r"benchmarks", r"eqrt bench --compare", "a minute; test_side_by_side.py runs it"),
     NotRun(r"reliability", r"PYTHONPATH=", "load over minutes, and SocketCAN: tests/socketcan"),
     NotRun(r"bridges", r"eqrt bridge ", "runs until it is told to end; see test_live_bridges.py"),
+    NotRun(r"", r"eqrt (view|top)$", "run until they are told to end; tests/view runs them"),
+    NotRun(
+        r"recording",
+        r"eqrt (replay|convert|play) ",
+        "need what a service has recorded of a drive: test_recording.py, test_bridges.py",
+    ),
     NotRun(r"training", r"torchrun ", "tests/training/test_ranks.py runs two processes"),
     NotRun(r"model", r"eqrt simulate acosta", "SUMO's Bologna scenarios are not in the repository"),
     NotRun(r"evaluation", r"eqrt eval .* --scheduler ", "needs a cluster; see test_evaluation.py"),

@@ -18,7 +18,7 @@ from drives import DRIVES, Car, Drive, cycle, first_seconds, object_list, shippe
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import LogError
 from eqrt.core.frames import Pose2
-from eqrt.core.scene import Scene
+from eqrt.core.scene import Scene, concatenate
 from eqrt.core.tile import TileInfo, encode
 from eqrt.export.can_recordings import EGO_ID, RECORDERS_OWN, CanLogReader
 from eqrt.export.encode import choose_ego, drive_messages, write_candump
@@ -99,11 +99,12 @@ def served(drive: Drive, text: str) -> dict[int, tuple[ForecastSet, Scene]]:
         listening,  # type: ignore[arg-type]  # listens, else the same
         load_tile(drive.tile) if drive.tile else None,
     )
-    messages = [candump_message(line) for line in text.splitlines()]
-    forecasts = [made for made in replay(pipeline, messages) if made.num_targets]
-    return {
-        f.cycle: pair for pair in zip(forecasts, listening.scenes, strict=True) for f in pair[:1]
-    }
+    found = {}
+    for forecast in replay(pipeline, [candump_message(line) for line in text.splitlines()]):
+        if listening.scenes:  # one per batch
+            found[forecast.cycle] = forecast, concatenate(listening.scenes)
+            listening.scenes.clear()
+    return found
 
 
 @cache

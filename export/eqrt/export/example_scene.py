@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.scene import Scene
+from eqrt.core.scene import Scene, concatenate
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.demo.command import PARTS
@@ -58,13 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class Watcher(Predictor):
-    """Keeps the newest scene; everybody stays where they are, as no prediction is looked at."""
+    """Keeps the scenes of a cycle; everybody stays where they are: no prediction is looked at."""
 
-    scene: Scene
+    scenes: list[Scene]
 
     def predict(self, scene: Scene) -> Prediction:
-        """Keep it."""
-        self.scene = scene
+        """Keep it, one per batch."""
+        self.scenes.append(scene)
         batch, steps = len(scene.history), self.contract.horizon_steps
         here = scene.history[:, :1, -1:] + scene.origin  # (B, 1, 1, 2)
         return Prediction(np.repeat(here, steps, axis=2), np.ones((batch, 1), np.float32))
@@ -73,6 +73,7 @@ class Watcher(Predictor):
 def moment() -> tuple[Scene, dict[int, Scored]]:
     """The scene at AT_S, and what became of those of its targets (by row) that drove on."""
     watcher = Watcher.load(DEFAULT_ARTIFACT)
+    watcher.scenes = []
     watcher.contract = replace(
         watcher.contract,
         num_agents=AGENTS,
@@ -87,7 +88,8 @@ def moment() -> tuple[Scene, dict[int, Scored]]:
     then: tuple[ForecastSet, Scene] | None = None
     for at_s, forecast in drive(watcher):
         if then is None and at_s > AT_S - DT_S / 2:
-            then = forecast, watcher.scene
+            then = forecast, concatenate(watcher.scenes)
+        watcher.scenes.clear()
         scored = [s for s in board.add(forecast) if then and s.anchor_s in then[0].anchor_s]
         if then and scored:
             return then[1], _movers(then[0], scored)

@@ -277,4 +277,5 @@ def _read_page(piece: LogToReplay) -> _Page | None:
 def _found(profile: str) -> str:
     """A profile's file by its absolute path; a built-in profile by its name."""
     path = Path(profile)
-    return str(path.resolve()) if path.suffix == ".toml" or path.name != profile else profile
+    is_file = path.suffix == ".toml" or path.name != profile
+    return str(path.resolve() if is_file else profile)
