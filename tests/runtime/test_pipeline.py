@@ -389,10 +389,10 @@ def crowd(count: int) -> list[Car]:
 
 
 @pytest.mark.parametrize(
-    ("seconds_per_run", "predicted"), [(0.01, 80), (0.02, 48), (0.03, 32), (0.05, 16)]
+    ("seconds_per_run", "predicted"), [(0.01, 80), (0.02, 80), (0.03, 64), (0.05, 32)]
 )
 def test_what_there_is_no_time_for_is_the_farthest(seconds_per_run: float, predicted: int) -> None:
-    """80 cars in batches of 16, in the 70 ms of a cycle: the rest goes by physics and says so."""
+    """80 cars in batches of 32, in the 70 ms of a cycle: the rest goes by physics and says so."""
     model = Slow(seconds_per_run)
     pipeline = pipeline_with(model, model.clock)
     (forecast,) = pipeline_fed(pipeline, cycle(crowd(80), 0.0), 0.0)

@@ -25,6 +25,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt serve`."""
     parser.epilog = "example: eqrt serve --can can0 --profile ars408 --tile town.tile"
     add_pipeline_arguments(parser)
+    _add_channels(parser)
+    _add_outputs(parser)
+    parser.add_argument(
+        "--wait-for-bus",
+        action=Switch,
+        help="at the start, wait for channels that are not there yet, or down (default: an error); "
+        "one that is lost later is waited for in any case",
+    )
+    _add_reporting(parser)
+    add_record_arguments(parser)
+    _add_realtime(parser)
+    Settings(parser, "serve")
+
+
+def _add_channels(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--can",
         required=True,
@@ -45,6 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="open channels for CAN FD, or not: then predictions are sent as classic messages "
         "(default: CAN FD if the channel can)",
     )
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out-can",
         metavar="CHANNEL",
@@ -73,16 +91,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="send predictions as UDP datagrams too, to a viewer or recorder, such as "
         f"{DEFAULT_ADDRESS} (repeatable)",
     )
-    parser.add_argument(
-        "--wait-for-bus",
-        action=Switch,
-        help="at the start, wait for channels that are not there yet, or down (default: an error); "
-        "one that is lost later is waited for in any case",
-    )
-    _add_reporting(parser)
-    add_record_arguments(parser)
-    _add_realtime(parser)
-    Settings(parser, "serve")
 
 
 def _add_reporting(parser: argparse.ArgumentParser) -> None:

@@ -17,13 +17,17 @@ from eqrt.core.scene import (
     concatenate,
     tile_origin,
 )
-from eqrt.runtime.prediction.predictor import MAX_BATCH, Prediction
+from eqrt.runtime.prediction.predictor import Prediction
 from eqrt.runtime.prediction.targets import Bool, Float64, Targets
 from eqrt.runtime.prediction.watched import Direct, Failed, TooLate, Watched
 from eqrt.runtime.tracking.ego import EgoState, EgoTracker
 from eqrt.runtime.tracking.tracks import Tracks, TrackStore
 
 Index = NDArray[np.intp]
+BATCH = 32
+"""Targets whose scenes are built, and given to the model, at once. Every batch searches all agents
+and lanes anew; a smaller one would leave less undone when time runs out.
+"""
 
 
 @dataclass(slots=True)
@@ -95,7 +99,7 @@ class Forecaster:
     def predict(self, tracks: Tracks, alive: Bool, ego: EgoState, deadline: Deadline) -> Raw:
         """Every track that is alive as a target, its history ending at its own last measurement.
 
-        Targets measured at the same time share a clock. Runs are of up to MAX_BATCH targets, and
+        Targets measured at the same time share a clock. Runs are of up to BATCH targets, and
         those that would end too late are left out.
         """
         begun_s = deadline.clock()
@@ -106,7 +110,7 @@ class Forecaster:
         longest_s = 0.0
         for number, batch in enumerate(batches):
             begun_s = deadline.clock()
-            part = slice(MAX_BATCH * number, MAX_BATCH * (number + 1))
+            part = slice(BATCH * number, BATCH * (number + 1))
             if begun_s + longest_s > deadline.shed_s:
                 raw.late[part.start :] = True
                 break
@@ -161,7 +165,7 @@ def _nearest_first(tracks: Tracks, alive: Bool, ego: EgoState) -> list[Index]:
     rows = np.flatnonzero(alive)
     offset = tracks.position[rows] - (ego.map_from_ego.x_m, ego.map_from_ego.y_m)
     rows = rows[np.argsort(np.hypot(offset[:, 0], offset[:, 1]), kind="stable")]
-    return [rows[start : start + MAX_BATCH] for start in range(0, len(rows), MAX_BATCH)]
+    return [rows[start : start + BATCH] for start in range(0, len(rows), BATCH)]
 
 
 def _by_time(tracks: Tracks, rows: Index) -> dict[float, Index]:
