@@ -151,7 +151,7 @@ def test_sources_that_become_invalid_are_told_with_the_reason(quiet: ServiceStat
 
     assert told(with_source(True), with_source(False), with_source(False), with_source(True)) == [
         "warning: source radar is not valid: no data",
-        "source radar is valid again",
+        "source radar is valid",
     ]
 
 

@@ -95,7 +95,7 @@ class Changes:
             return
         if source.valid and before is None:
             return
-        state = "is valid again" if source.valid else f"is not valid: {source.reason}"
+        state = "is valid" if source.valid else f"is not valid: {source.reason}"
         level = Level.INFO if source.valid else Level.WARNING
         self._log.say(
             level, f"source-{source.name}", f"source {source.name} {state}", source=source.name
