@@ -34,12 +34,14 @@ def options(*more: str) -> list[str]:
 
 
 def without_rights() -> list[str]:
-    """Runs the rest of a command as nobody, with the limits of an ordinary login."""
+    """Runs the rest of a command with no capability and the limits of an ordinary login.
+
+    Root stays root, without what makes it mighty: it must still reach its own interpreter.
+    """
     limits = ["prlimit", "--rtprio=0", "--memlock=8388608"]
     if os.geteuid() != 0:
         return limits
-    return [*limits, needed("setpriv", "util-linux"), "--reuid=65534", "--clear-groups",
-            "--bounding-set=-all", "--inh-caps=-all"]  # fmt: skip
+    return [*limits, needed("setpriv", "util-linux"), "--bounding-set=-all", "--inh-caps=-all"]
 
 
 def refused(*more: str) -> subprocess.CompletedProcess[str]:
