@@ -46,3 +46,8 @@ class LogError(EqrtError):
 
 class RecordingError(EqrtError):
     """A recording cannot be written."""
+
+
+def in_one_line(error: BaseException) -> str:
+    """What an error says; libraries use several lines, quote what they read, or say nothing."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from eqrt.core.errors import LogError
+from eqrt.core.errors import LogError, in_one_line
 
 _SHOWN_PERCENTILES = (50, 95, 99)
 
@@ -200,8 +200,8 @@ def _targets(lines: Iterable[bytes], where: str) -> Iterator[_Target]:
             yield _DECODER.decode(line)
         except msgspec.MsgspecError as error:
             raise LogError(
-                f"{where}: line {number} is no prediction ({error}); `eqrt replay --out` writes "
-                "JSON lines"
+                f"{where}: line {number} is no prediction ({in_one_line(error)}); "
+                "`eqrt replay --out` writes JSON lines"
             ) from error
 
 

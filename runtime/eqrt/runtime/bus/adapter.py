@@ -9,6 +9,8 @@ from collections import deque
 
 import can
 
+from eqrt.core.errors import in_one_line
+
 _NOTICE_END_S = 0.1  # how often the thread looks whether it is to end
 _END_S = 1.0  # a driver whose device is gone may never come back from reading
 
@@ -59,8 +61,7 @@ class Adapter:
             self._bell.recv(4096)
         messages = [self._heard.popleft() for _ in range(len(self._heard))]
         if self._failure is not None and not messages:
-            reason = " ".join(f"{self._failure}".split()) or type(self._failure).__name__
-            raise can.CanOperationError(reason) from self._failure
+            raise can.CanOperationError(in_one_line(self._failure)) from self._failure
         if self._failure is not None:
             self._ring()
         return messages

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import can
 
-from eqrt.core.errors import AbsentBusError, BusError
+from eqrt.core.errors import AbsentBusError, BusError, in_one_line
 from eqrt.runtime.bus.local_bus import LocalBus
 
 LOCAL = "eqrt_local"
@@ -111,7 +111,7 @@ def _explanation(channel: str, interface: str, error: Exception) -> str:
         return f"there is no CAN interface {interface!r}; known are {', '.join(interface_names())}"
     if interface == LOCAL:
         return f"cannot open CAN channel {channel!r} through {LOCAL}: {error}"
-    reason = " ".join(f"{error}".split()) or type(error).__name__
+    reason = in_one_line(error)
     if isinstance(error.__cause__, OSError):
         reason += f": {error.__cause__.strerror}"
     advice = "is its driver or Python package installed, and the channel's name right?"

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import can
 
-from eqrt.core.errors import AbsentBusError
+from eqrt.core.errors import AbsentBusError, in_one_line
 from eqrt.runtime.bus.health import BusHealth, BusState, told_overrun, told_state
 from eqrt.runtime.bus.links import Link
 
@@ -222,4 +222,4 @@ def _words(error: Exception) -> str:
     """An exception in one line."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
-    return " ".join(f"{error}".split()) or type(error).__name__
+    return in_one_line(error)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from eqrt.core.errors import ProfileError
+from eqrt.core.errors import ProfileError, in_one_line
 from eqrt.core.files import read_at_most
 from eqrt.runtime.decoding.dbc_tables import Signal
 
@@ -113,8 +113,7 @@ def _parsed(parse: Callable[..., Any], text: str, path: Path) -> list[Any]:
         with contextlib.suppress(Exception):
             if messages := list(parse(f'VERSION ""\n\n{layout}\n', strict=False).messages):
                 return messages
-        reason = " ".join(str(error).split())
-        raise ProfileError(f"the DBC {path} does not parse: {reason}") from error
+        raise ProfileError(f"the DBC {path} does not parse: {in_one_line(error)}") from error
 
 
 def _message(message: Any) -> DbcMessage:

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import UsageError, in_one_line
 from eqrt.core.frames import Pose2
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
@@ -117,7 +117,7 @@ def decode_datagram(payload: bytes) -> Datagram | ServiceStatus:
             )
         wire = _DECODER.decode(payload)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise ValueError(f"not a datagram of eqrt ({error})") from error
+        raise ValueError(f"not a datagram of eqrt ({in_one_line(error)})") from error
     if isinstance(wire, _StatusWire):
         return wire.status
     return Datagram(wire.part, wire.parts, _forecasts(wire))

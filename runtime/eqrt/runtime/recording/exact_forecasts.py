@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from eqrt.core.errors import in_one_line
 from eqrt.core.frames import Pose2
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 
@@ -39,7 +40,9 @@ def decode_forecasts(payload: bytes) -> ForecastSet:
         values["map_from_ego"] = Pose2(*plain["map_from_ego"])
         return ForecastSet(**values)
     except (msgspec.MsgspecError, KeyError, TypeError) as error:
-        raise ValueError(f"not the forecasts of this version of eqrt ({error})") from error
+        raise ValueError(
+            f"not the forecasts of this version of eqrt ({in_one_line(error)})"
+        ) from error
 
 
 def _plain(value: Any) -> Any:

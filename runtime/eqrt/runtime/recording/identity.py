@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from eqrt.core.errors import LogError
+from eqrt.core.errors import LogError, in_one_line
 from eqrt.runtime.decoding.profile import profile_files
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.recording.order import Attached
@@ -109,8 +109,8 @@ def read_identity(values: Mapping[str, str], path: Path) -> Identity:
         return msgspec.convert(dict(values), Identity)
     except msgspec.ValidationError as error:
         raise LogError(
-            f"{path}: its description is not of this version of eqrt ({error}); read it with the "
-            f"version that wrote it, {values.get('eqrt', 'which it does not say')}"
+            f"{path}: its description is not of this version of eqrt ({in_one_line(error)}); "
+            f"read it with the version that wrote it, {values.get('eqrt', 'which it does not say')}"
         ) from error
 
 

@@ -15,7 +15,7 @@ from typing import IO, Protocol, TypeVar
 import can
 import msgspec
 
-from eqrt.core.errors import LogError
+from eqrt.core.errors import LogError, in_one_line
 from eqrt.runtime.bus.logs import LogReader
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
@@ -200,7 +200,9 @@ def _decoded(decoder: _Decoder[T], payload: bytes, recording: Recording) -> T:
     try:
         return decoder.decode(payload)
     except msgspec.MsgspecError as error:
-        raise LogError(f"{recording.paths[0]}: an entry cannot be read ({error})") from error
+        raise LogError(
+            f"{recording.paths[0]}: an entry cannot be read ({in_one_line(error)})"
+        ) from error
 
 
 def _head(path: Path) -> Head:

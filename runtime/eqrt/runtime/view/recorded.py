@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.errors import LogError
+from eqrt.core.errors import LogError, in_one_line
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
@@ -81,8 +81,8 @@ def _lines(path: Path) -> Iterator[Line]:
                     yield decoder.decode(text)
                 except (msgspec.MsgspecError, UnicodeDecodeError) as error:
                     raise LogError(
-                        f"{path}:{number}: not a line of `eqrt replay` ({error}); what comes "
-                        "before it can be watched"
+                        f"{path}:{number}: not a line of `eqrt replay` ({in_one_line(error)}); "
+                        "what comes before it can be watched"
                     ) from error
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror}") from error
