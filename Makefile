@@ -15,7 +15,7 @@ MUTATION_MODULES ?=
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures view-figures faults soak load under-load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures systems-table view-figures faults soak load under-load clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -68,6 +68,9 @@ under-load: $(RUNTIME_VENV)/.installed ## measure the service beside three busy 
 load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a service, in 2 minutes; nothing may be lost
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60
 
+systems-table: $(VENV)/.installed ## put all systems side by side into docs/: time, error, plot; wants a quiet machine
+	@PYTHONPATH=tests $(VENV)/bin/python -m bench.systems.run --write
+
 view-figures: $(VENV)/.installed ## print what watching costs: frames of the page, latency beside browsers
 	@PYTHONPATH=tests $(VENV)/bin/python tests/bench/view_figures.py
 
@@ -80,7 +83,7 @@ soak: $(RUNTIME_VENV)/.installed ## a simulated day and a real hour of traffic, 
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m soak.run
 
 clean: ## remove the environments and everything else that was made here
-	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance .artifacts .fuzz .mutation .coverage
+	rm -rf .venv .venv-* build dist site .*_cache .benchmarks .hypothesis .conformance .artifacts .fuzz .mutation .coverage .systems
 	rm -rf deploy/examples/build deploy/examples/javascript/node_modules
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,19 @@ AGREEMENT_M = 1e-3
 
 Tensors = Mapping[str, NDArray[np.float32]]
 """A network's outputs by the contract's names."""
+Translate = Callable[[nn.Module, ModelContract, dict[str, str]], bytes]
+"""A network, its contract and metadata -> the bytes of a model file: `to_onnx`, and what it is
+compared with."""
 
 
 def write_artifact(
-    model: nn.Module, contract: ModelContract, card: Card, folder: Path, changes: str | None = None
+    model: nn.Module,
+    contract: ModelContract,
+    card: Card,
+    folder: Path,
+    changes: str | None = None,
+    *,
+    translate: Translate = to_onnx,
 ) -> float:
     """Export `model`, verify it, and put it at `folder` (replacing an artifact there).
 
@@ -55,7 +64,7 @@ def write_artifact(
         }
         scenes = named_scenes(contract)
         expected = {name: _expected(model, contract, scene) for name, scene in scenes.items()}
-        (draft / "model.onnx").write_bytes(to_onnx(model, contract, metadata))
+        (draft / "model.onnx").write_bytes(translate(model, contract, metadata))
         (draft / "contract.json").write_text(contract.to_json() + "\n", encoding="utf-8")
         text = model_card(contract, card, _turned_apart_m(expected))
         (draft / "README.md").write_text(text, encoding="utf-8")

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bench.cold_start import measure_cold_start
 from eqrt.runtime.bench.environment import read_environment
@@ -48,7 +49,7 @@ def bench_side_by_side(
     names = _names(folders, predictors)
     ids = {name: loaded.model_id for name, loaded in zip(names, predictors, strict=True)}
     known = match(evals, ids)
-    pools = [record_scenes(folder) for folder in folders]
+    pools = _pools(folders, predictors)
     models = [
         _compared(folder, name, loaded, known.get(name), settings.threads)
         for folder, name, loaded in zip(folders, names, predictors, strict=True)
@@ -110,6 +111,26 @@ def _compared(
         cold_start=measure_cold_start(folder, threads),
         accuracy=from_card(facts["metrics"], name) if known is None else known.model,
     )
+
+
+def _pools(folders: Sequence[Path], predictors: Sequence[TimedPredictor]) -> list[ScenePool]:
+    """Of each model; those that are given the same inputs share one."""
+    inputs = [
+        replace(
+            predictor.contract,
+            name="",
+            version="",
+            num_modes=1,
+            horizon_steps=1,
+            covariances=False,
+        )
+        for predictor in predictors
+    ]
+    recorded: dict[ModelContract, ScenePool] = {}
+    for folder, asked in zip(folders, inputs, strict=True):
+        if asked not in recorded:
+            recorded[asked] = record_scenes(folder)
+    return [recorded[asked] for asked in inputs]
 
 
 def _loads(

@@ -138,7 +138,9 @@ def _remarks(report: SideBySide) -> Iterator[str]:
     bad = [f"{case.title}: {'; '.join(case.reasons)}" for case in report.cases if not case.valid]
     yield "VALID." if report.valid else f"INVALID: {'. '.join(bad) or 'not all was measured'}."
     sources = _sources(report)
-    if sources:
+    if len(sources) == 1:
+        yield f"Errors are from {next(iter(sources))}."
+    elif sources:
         yield ""
         yield "Errors are from:"
         yield ""
