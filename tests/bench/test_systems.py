@@ -11,8 +11,9 @@ import pytest
 from bench.systems.accuracy import Errors, read_errors
 from bench.systems.chosen import NAIVE, SHIPPED, all_systems, config_name, folder_name
 from bench.systems.exports import export
-from bench.systems.pages import ALL, DOCS, EXPORTS, between_markers, naive_table, plot
-from bench.systems.run import CONFIGS, compare, settings
+from bench.systems.origin import is_made_by, origin_of
+from bench.systems.pages import ALL, DOCS, EXPORTS, between_markers, left_out, naive_table, plot
+from bench.systems.run import CONFIGS, compare, export_all, settings
 from eqrt.runtime.bench.side_by_side.report import SideBySide, markdown
 from tiny_training import tiny_file
 
@@ -42,16 +43,14 @@ def test_the_naive_export_is_the_same_network_left_as_it_is(models: Path) -> Non
     assert any(node.doc_string or node.metadata_props for node in naive.node)
 
 
-def test_a_file_is_exported_again_when_what_it_is_made_by_has_changed(models: Path) -> None:
-    config, folder = models / "tiny.toml", models / TINY
-    made_by = models / f"{TINY}.made-by"
-    before = (folder / "model.onnx").stat().st_mtime_ns
-    export(TINY, config, folder)
-    assert (folder / "model.onnx").stat().st_mtime_ns == before
-    made_by.write_text("other sources", encoding="utf-8")
-    export(TINY, config, folder)
-    assert (folder / "model.onnx").stat().st_mtime_ns > before
-    assert made_by.read_text(encoding="utf-8") != "other sources"
+def test_a_file_is_kept_as_long_as_what_it_is_made_by(models: Path) -> None:
+    config, file = models / "tiny.toml", models / TINY / "model.onnx"
+    assert is_made_by(origin_of(TINY, config), models / TINY)
+    before = file.stat().st_mtime_ns
+    export_all([TINY], models, models)
+    assert file.stat().st_mtime_ns == before
+    config.write_text(config.read_text("utf-8").replace("layers = 1", "layers = 2"), "utf-8")
+    assert not is_made_by(origin_of(TINY, config), models / TINY)
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +69,7 @@ def test_all_are_measured_in_turns_and_stand_in_the_tables(found: SideBySide) ->
     rows = {line.split(" | ")[0]: line for line in markdown(found).splitlines()}
     assert rows[f"| {TINY + NAIVE}"].endswith("| 1.629 | 3.583 |")
     assert rows["| Kalman filter"].endswith("| 2.492 | 5.675 |")
+    assert "paper-7-rotated-cnn." in left_out(found)
     head, _, row, *_ = (line.split(" | ") for line in naive_table(found).splitlines())
     assert len(row) == len(head)
     cells = dict(zip(head, row, strict=True))

@@ -11,33 +11,22 @@ contract, and are verified against the network on the same test vectors.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import sys
 from pathlib import Path
 
-import onnxscript
 import torch
 from torch import nn
 
 from bench.systems.chosen import NAIVE, config_name
 from bench.systems.naive import naive
+from bench.systems.origin import note, origin_of
 from eqrt.export.artifact import write_artifact
 from eqrt.export.to_onnx import to_onnx
 from eqrt.training.checkpoint import Card
 from eqrt.training.configuration import load_config
 from eqrt.training.networks.registry import ModelConfig, build_network
-from source_tree import ROOT
 
 SEED = 1
-_SOURCES = (
-    "runtime/eqrt/core/contract.py",
-    "training/eqrt/training/networks/*.py",
-    "export/eqrt/export/to_onnx.py",
-    "export/eqrt/export/folded/*.py",
-    "tests/bench/systems/naive.py",
-)
-"""What a file is made by."""
 
 
 def main(arguments: list[str]) -> int:
@@ -48,14 +37,7 @@ def main(arguments: list[str]) -> int:
 
 
 def export(name: str, config: Path, folder: Path) -> None:
-    """Write the artifact, unless `folder` has it already, made by these sources.
-
-    Raises EqrtError if the file does not answer as the network does.
-    """
-    made_by, origin = folder.with_name(f"{folder.name}.made-by"), origin_of(name, config)
-    if made_by.exists() and made_by.read_text(encoding="utf-8") == origin:
-        return
-    made_by.unlink(missing_ok=True)
+    """Write the artifact. Raises EqrtError if the file does not answer as the network does."""
     training = load_config(config)
     network = untrained(training.model)
     contract = training.model.contract(name, "0.0.0")
@@ -74,28 +56,13 @@ def export(name: str, config: Path, folder: Path) -> None:
     )
     translate = naive if name.endswith(NAIVE) else to_onnx
     write_artifact(network, contract, card, folder, translate=translate)
-    made_by.write_text(origin, encoding="utf-8")
+    note(origin_of(name, config), folder)
 
 
 def untrained(config: ModelConfig) -> nn.Module:
     """The network with random weights, always the same."""
     torch.manual_seed(SEED)
     return build_network(config).eval()
-
-
-def origin_of(name: str, config: Path) -> str:
-    """What a file depends on: its configuration, the networks, the exporter, and their versions."""
-    digest = hashlib.sha256(config.read_bytes())
-    for path in sorted(path for pattern in _SOURCES for path in ROOT.glob(pattern)):
-        digest.update(path.read_bytes())
-    return json.dumps(
-        {
-            "name": name,
-            "sources": digest.hexdigest(),
-            "torch": torch.__version__,
-            "onnxscript": onnxscript.__version__,
-        }
-    )
 
 
 if __name__ == "__main__":

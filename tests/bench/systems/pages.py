@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from bench.systems.chosen import NAIVE, short_name
+from bench.systems.chosen import NAIVE, all_systems, short_name
 from eqrt.runtime.bench.report import Case, counted
 from eqrt.runtime.bench.side_by_side.pareto import picture, points_of
 from eqrt.runtime.bench.side_by_side.report import ComparedModel, SideBySide, markdown, middle_ns
@@ -22,9 +22,17 @@ EXPORTS = "systems.md", "naive exports"
 
 def write_tables(found: SideBySide) -> None:
     """Both tables into their pages."""
-    for (page, name), text in ((ALL, markdown(found)), (EXPORTS, naive_table(found))):
+    tables = ((ALL, markdown(found) + left_out(found)), (EXPORTS, naive_table(found)))
+    for (page, name), text in tables:
         path = DOCS / page
         path.write_text(between_markers(path, name, text), encoding="utf-8")
+
+
+def left_out(found: SideBySide) -> str:
+    """A paragraph that names the systems that this run was without; nothing if it had all."""
+    measured = {model.name for model in found.models}
+    missing = [name for name in all_systems() if name not in measured]
+    return f"\nNot in this run: {'; '.join(missing)}.\n" if missing else ""
 
 
 def between_markers(page: Path, name: str, text: str) -> str:

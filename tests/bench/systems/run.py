@@ -21,6 +21,7 @@ from pathlib import Path
 
 from bench.systems.accuracy import Errors, read_errors
 from bench.systems.chosen import all_systems, config_name, folder_name
+from bench.systems.origin import is_made_by, origin_of
 from bench.systems.pages import PLOT, naive_table, plot, write_tables
 from eqrt.runtime.bench.environment import read_environment
 from eqrt.runtime.bench.json_form import to_json
@@ -52,16 +53,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def export_all(names: Sequence[str], configs: Path, models: Path) -> None:
-    """As many at a time as there are cores, each in a process of its own: this one has no torch."""
+    """Those that are not there, or made by other sources: as many at a time as there are cores.
+
+    Each in a process of its own, so that this one never loads torch.
+    """
     models.mkdir(parents=True, exist_ok=True)
     cores = len(read_environment().cores_allowed)
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
 
     def export(name: str) -> None:
-        print(f"exporting {name}, unless it is there", flush=True)
-        module = [sys.executable, "-m", "bench.systems.exports"]
-        order = [name, str(configs), str(models / folder_name(name))]
-        subprocess.run([*module, *order], check=True, env=one_thread)
+        folder, config = models / folder_name(name), configs / f"{config_name(name)}.toml"
+        if not is_made_by(origin_of(name, config), folder):
+            print(f"exporting {name}", flush=True)
+            module = [sys.executable, "-m", "bench.systems.exports"]
+            order = [name, str(configs), str(folder)]
+            subprocess.run([*module, *order], check=True, env=one_thread)
 
     with ThreadPoolExecutor(cores) as pool:
         list(pool.map(export, names))

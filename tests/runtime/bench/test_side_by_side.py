@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -28,6 +29,7 @@ from eqrt.runtime.bench.schedule import Turn
 from eqrt.runtime.bench.side_by_side.accuracy import Accuracy, from_card, match, read_eval
 from eqrt.runtime.bench.side_by_side.pareto import Point, draw, front
 from eqrt.runtime.bench.side_by_side.report import SCHEMA, ComparedModel, SideBySide, markdown
+from eqrt.runtime.drawing.names import Box, place_names
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from handmade_model import write_handmade
 from source_tree import ROOT
@@ -273,3 +275,23 @@ def test_the_plot_names_everybody_and_needs_nothing_else() -> None:
     assert "href" not in text
     with pytest.raises(EqrtError, match="no model's errors are known"):
         draw(side_by_side(None, None))
+
+
+def test_names_in_a_crowd_cover_neither_each_other_nor_dots_nor_lines() -> None:
+    inside = Box(0, 0, 600, 400)
+    crowd = [(300.0 + 6 * i, 200.0 + 2 * (i % 3)) for i in range(9)]
+    dots = [*crowd, (20.0, 20.0), (590.0, 390.0)]
+    line = Box(0, 199, 600, 201)
+    places = place_names(dots, [f"model {i}" for i in range(len(dots))], inside, [line])
+    boxes = [place.box for place in places]
+    assert all(inside.holds(box) and not box.meets(line) for box in boxes)
+    assert not any(one.meets(other) for one, other in combinations(boxes, 2))
+    assert not any(box.meets(Box(x, y, x, y)) for box in boxes for x, y in dots)
+    assert all(place.leader is None for place in places[-2:])
+    assert any(place.leader is not None for place in places)
+
+
+def test_a_name_without_any_room_stands_beside_its_dot() -> None:
+    (place,) = place_names([(10.0, 10.0)], ["a long name"], Box(0, 0, 20, 20))
+    assert place.leader is None
+    assert place.box.nearest(10.0, 10.0) == (19.0, 10.0)
