@@ -24,9 +24,15 @@ SECTIONS = ("Trained on 80 % of the packed Argoverse 1 scenes", "The paper's sev
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small network that reads what the shipped one reads, exported in both ways."""
+    """One layer of a network that reads what the shipped one reads, exported in both ways."""
     folder = tmp_path_factory.mktemp("systems")
-    sizes = (("num_agents", 3, 16), ("num_centerlines", 2, 6), ("centerline_points", 8, 21))
+    sizes = (
+        ("num_agents", 3, 16),
+        ("num_centerlines", 2, 6),
+        ("centerline_points", 8, 21),
+        ("width", 16, 96),  # torch.onnx.export folds what is smaller
+        ("hidden", 32, 192),
+    )
     config = tiny_file(folder, *((f"{n} = {old}", f"{n} = {new}") for n, old, new in sizes))
     for name in (TINY, TINY + NAIVE):
         export(name, config, folder / folder_name(name))
@@ -58,7 +64,7 @@ def found(models: Path) -> SideBySide:
     kept = read_errors()
     shipped = kept.models[SHIPPED]
     errors = Errors({SHIPPED: shipped, TINY: kept.models["eqrt-small"]}, kept.physics, {})
-    return compare([TINY, TINY + NAIVE], models, errors, settings((1, 2), 1.0))
+    return compare([TINY, TINY + NAIVE], models, errors, settings((2,), 0.3))
 
 
 def test_all_are_measured_in_turns_and_stand_in_the_tables(found: SideBySide) -> None:
@@ -83,7 +89,7 @@ def test_all_are_measured_in_turns_and_stand_in_the_tables(found: SideBySide) ->
 def test_the_plot_has_all_but_naive_files(found: SideBySide) -> None:
     root = ElementTree.fromstring(plot(found))
     texts = {part.text for part in root if part.tag.endswith("text")}
-    assert {SHIPPED, TINY, "constant velocity", "ms, 1 target, p50"} <= texts
+    assert {SHIPPED, TINY, "constant velocity", "ms, 2 targets, p50"} <= texts
     assert TINY + NAIVE not in texts
 
 
