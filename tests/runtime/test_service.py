@@ -66,12 +66,26 @@ def test_a_wall_clock_that_is_set_changes_nothing(set_by_s: float) -> None:
     np.testing.assert_allclose(told, [50.0, 50.1, 50.2], atol=1e-6)
 
 
-def test_a_wall_clock_set_forward_a_little_holds_the_time_for_that_one_message() -> None:
-    """It looks like a queue; the next message's stamp puts it right."""
+@pytest.mark.parametrize("set_by_s", [3600.0, -3600.0, 5.0, -5.0])
+def test_messages_that_waited_while_the_wall_clock_was_set_arrived_when_they_did(
+    set_by_s: float,
+) -> None:
+    """Ten of them, 0.1 s apart, are read at once; the clock was set after the fifth had come."""
     clock = ArrivalClock()
-    clock.now_s(50.0, WALL_S, WALL_S)
-    assert clock.now_s(50.1, WALL_S + 0.1, WALL_S + 5.1) == 50.0
-    assert clock.now_s(50.2, WALL_S + 5.2, WALL_S + 5.2) == 50.2
+    clock.now_s(50.0, None, WALL_S)
+    arrived_s = [50.1 + k / 10 for k in range(10)]
+    stamps_s = [WALL_S + t - 50.0 + (set_by_s if t > 50.55 else 0.0) for t in arrived_s]
+    told = [clock.now_s(51.1, stamp_s, WALL_S + 1.1 + set_by_s) for stamp_s in stamps_s]
+    np.testing.assert_allclose(told, arrived_s, atol=1e-6)
+
+
+def test_a_wall_clock_that_is_set_again_and_again_is_not_remembered_for_ever() -> None:
+    """By how it was set last, and shortly before: another second is no reason to look far back."""
+    clock = ArrivalClock()
+    for k in range(1000):
+        clock.now_s(50.0 + k, None, WALL_S + 3600.0 * (-1) ** k)
+    waited = clock.now_s(1050.0, WALL_S + 3600.0 - 0.5, WALL_S + 3600.0)
+    assert waited == pytest.approx(1049.5, abs=1e-6)
 
 
 @pytest.mark.parametrize("stamp_s", [0.0, 1234.5, WALL_S - MAX_QUEUED_S - 1.0, WALL_S + 0.5])

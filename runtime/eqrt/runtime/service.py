@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import can
@@ -16,7 +17,10 @@ from eqrt.runtime.status_book import Channels, StatusBook
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly
 _REPORT_S = 1.0
-MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but a wall clock that was set
+MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but another clock
+_SET_S = 0.05  # a wall clock that moves by more was set; NTP slews by less than 1 ms a second
+_ROUNDED_S = 1e-3  # by which a stamp may lie ahead of now, because it has a coarser clock
+_MOST_WALLS = 8  # more than anybody sets it within MAX_QUEUED_S; bounds the work of each message
 
 
 class Receiver(Channels, Protocol):
@@ -90,9 +94,7 @@ class Service:
         """Serve until told to stop."""
         report_due_s = time.monotonic() + _REPORT_S
         while not should_stop():
-            message = self._receiver.recv(_NAP_S)
-            stamp_s = None if message is None else message.timestamp
-            now_s = self._clock.now_s(time.monotonic(), stamp_s, time.time())
+            message, now_s = self._receive()
             if self._witness:
                 self._witness.begin(message, now_s)
             self._publish(self._pipeline.poll(now_s), now_s)
@@ -105,6 +107,20 @@ class Service:
                 report_due_s = self._report(monotonic_s, report_due_s)
             for chore in self._chores:
                 chore()
+
+    def _receive(self) -> tuple[can.Message | None, float]:
+        """The next message and when it arrived; None and a time by which all have been received.
+
+        Whoever is held up while waiting is told that the time is over, and nothing of what came
+        meanwhile. That the queue is empty is only true of a time before it was looked at.
+        """
+        message = self._receiver.recv(_NAP_S)
+        if message is None:
+            monotonic_s, wall_s = time.monotonic(), time.time()
+            message = self._receiver.recv(0.0)
+            if message is None:
+                return None, self._clock.now_s(monotonic_s, None, wall_s)
+        return message, self._clock.now_s(time.monotonic(), message.timestamp, time.time())
 
     def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
         for forecast in forecasts:
@@ -125,17 +141,54 @@ class ArrivalClock:
 
     Messages wait in the driver's queue while the service is busy. Their stamps (wall clock) tell
     how long, and the pipeline's time follows them, so that a queue full of messages does not look
-    like a bus that has fallen silent. A stamp that is not from the last seconds says that the wall
-    clock was set, and nothing else. The time told never goes back.
+    like a bus that has fallen silent. Where the wall clock was set meanwhile, those that were
+    stamped before are read by the clock as it was then. A stamp that is not from the last seconds
+    by any clock is another clock's and says nothing. The time told never goes back.
     """
 
     def __init__(self) -> None:
         self._told_s = -math.inf
+        self._walls: list[_WallClock] = []
+        """Those that a message which still waits may be stamped by, the present one first."""
 
     def now_s(self, monotonic_s: float, stamp_s: float | None, wall_s: float) -> float:
         """When the message stamped `stamp_s` arrived; None = the queue is empty, and it is now."""
-        waited_s = 0.0 if stamp_s is None else wall_s - stamp_s
-        if not 0.0 <= waited_s <= MAX_QUEUED_S:
-            waited_s = 0.0
-        self._told_s = max(self._told_s, monotonic_s - waited_s)
+        self._look(wall_s - monotonic_s, monotonic_s)
+        arrived_s = monotonic_s if stamp_s is None else self._arrival(stamp_s, monotonic_s)
+        self._told_s = max(self._told_s, arrived_s)
         return self._told_s
+
+    def _look(self, ahead_s: float, monotonic_s: float) -> None:
+        """Notice that the wall clock was set; one that runs a little fast or slow was not."""
+        walls = self._walls
+        if walls and abs(walls[0].ahead_s - ahead_s) < _SET_S:
+            walls[0].ahead_s, walls[0].seen_s = ahead_s, monotonic_s
+        else:
+            walls.insert(0, _WallClock(ahead_s, monotonic_s))
+            del walls[_MOST_WALLS:]
+        while monotonic_s - walls[-1].seen_s > MAX_QUEUED_S:
+            walls.pop()
+
+    def _arrival(self, stamp_s: float, monotonic_s: float) -> float:
+        """The stamp on the monotonic clock, by the newest wall clock that makes sense of it.
+
+        Messages come in the order of their arrival: a clock by which one would have come before
+        what was told already is not the one that stamped it.
+        """
+        possible_s = [
+            min(arrived_s, monotonic_s)
+            for wall in self._walls
+            if -_ROUNDED_S <= monotonic_s - (arrived_s := stamp_s - wall.ahead_s) <= MAX_QUEUED_S
+        ]
+        in_order_s = (arrived_s for arrived_s in possible_s if arrived_s >= self._told_s)
+        return next(in_order_s, possible_s[0] if possible_s else monotonic_s)
+
+
+@dataclass(slots=True)
+class _WallClock:
+    """The wall clock as it was set for some time."""
+
+    ahead_s: float
+    """Of the monotonic clock."""
+    seen_s: float
+    """When it was last so, on the monotonic clock."""

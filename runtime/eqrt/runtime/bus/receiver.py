@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 import selectors
 import time
@@ -67,10 +68,10 @@ class Receiver:
     def _read(self, wait_s: float) -> None:
         """One batch of each channel that has something, after waiting for the first."""
         ready = self._selector.select(None if wait_s == math.inf else wait_s)
-        for key, _ in ready:
-            self._pending += key.data.read()
-        if len(ready) > 1:  # channels that were read one after the other spoke at the same time
-            self._pending = deque(sorted(self._pending, key=attrgetter("timestamp")))
+        batches = [key.data.read() for key, _ in ready]
+        # Channels that were read one after the other spoke at the same time. Merged, not sorted:
+        # where the wall clock was set back meanwhile, each channel keeps its own order.
+        self._pending.extend(heapq.merge(*batches, key=attrgetter("timestamp")))
 
     def connection(self, channel: str) -> Connection:
         """What sends on a channel, whether or not it is there at the moment."""

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 SUFFIX = ".mcap"
-_NAME = re.compile(r"eqrt-\d{8}T\d{6}Z-([0-9a-f]{8})-\d{4,}\.mcap")
+_NAME = re.compile(r"eqrt-\d{8}T\d{6}Z-([0-9a-f]{8})-(\d{4,})\.mcap")
 
 
 def file_name(run: str, part: int, time_s: float) -> str:
@@ -28,6 +28,12 @@ def run_of(path: Path) -> str:
     """Which run a file of `recordings_in` belongs to."""
     named = _NAME.fullmatch(path.name)
     return named[1] if named else ""
+
+
+def part_of(path: Path) -> int:
+    """Which part of its run it is: the order of the files, however the clock was set meanwhile."""
+    named = _NAME.fullmatch(path.name)
+    return int(named[2]) if named else 0
 
 
 def total_bytes(folder: Path) -> int:

@@ -20,7 +20,7 @@ from eqrt.runtime.bus.logs import LogReader
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.exact_forecasts import decode_forecasts
-from eqrt.runtime.recording.folder import SUFFIX, recordings_in, run_of
+from eqrt.runtime.recording.folder import SUFFIX, part_of, recordings_in, run_of
 from eqrt.runtime.recording.identity import Identity, read_identity
 from eqrt.runtime.recording.mcap_entries import Head, Raw, read_entries, read_head
 from eqrt.runtime.recording.steps import CanEntry, Lost, PollEntry, Step, can_message
@@ -171,7 +171,7 @@ def read_recordings(path: Path) -> list[Recording]:
             f"{path}: there is no recording of eqrt in it (eqrt-*{SUFFIX}); give a recorded CAN "
             "log or a folder of `eqrt serve --record`"
         )
-    return [Recording(files) for files in runs.values()]
+    return [Recording(sorted(files, key=part_of)) for files in runs.values()]
 
 
 def is_recording(path: Path) -> bool:
