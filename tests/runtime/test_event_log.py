@@ -7,13 +7,15 @@ import json
 import re
 import time
 from datetime import datetime
+from pathlib import Path
 
 import msgspec
 import pytest
 
 from drives import shipped_predictor
+from eqrt.runtime.bus.health import BusState, BusWord
 from eqrt.runtime.decoding.profile import load_profile
-from eqrt.runtime.operation.changes import COUNTED, MODES, Changes
+from eqrt.runtime.operation.changes import COUNTED, MODES, BusTeller, Changes
 from eqrt.runtime.operation.event_log import PER_MINUTE, EventLog, Level
 from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
@@ -136,12 +138,48 @@ def test_buses_that_come_and_go_are_told(quiet: ServiceStatus) -> None:
         return msgspec.structs.replace(quiet, buses=[bus])
 
     assert told(
-        with_bus("UP", 0), with_bus("BUS_OFF", 0), with_bus("UP", 5), with_bus("UP", 5)
+        with_bus("UP", 0), with_bus("ERROR_PASSIVE", 0), with_bus("UP", 5), with_bus("UP", 5)
     ) == [
-        "error: bus can0 is BUS_OFF",
+        "error: bus can0 is ERROR_PASSIVE",
         "bus can0 is UP",
         "warning: bus can0: 5 messages were lost, because they came too fast",
     ]
+
+
+def lost(channel: str) -> BusWord:
+    return BusWord(channel=channel, state=BusState.DOWN, text=f"{channel} is lost: unplugged")
+
+
+def test_a_lost_bus_is_said_once_where_log_and_errors_are_one_file(tmp_path: Path) -> None:
+    """As on a terminal and in the journal; in another file it is said again, not more often."""
+    out, other = tmp_path / "out", tmp_path / "other"
+    with out.open("w") as stdout, out.open("a") as same, other.open("w") as elsewhere:
+        BusTeller(EventLog(stream=stdout, environment={}), same)(lost("can0"))
+        assert out.read_text().count("can0 is lost: unplugged\n") == 1
+        tell = BusTeller(EventLog(stream=stdout, environment={}), elsewhere)
+        for _ in range(3 * PER_MINUTE):
+            tell(lost("can1"))
+        tell(BusWord(channel="can1", state=BusState.UP, text="can1 is back after 3.2 s"))
+    lines = ["eqrt serve: can1 is lost: unplugged"] * PER_MINUTE
+    assert other.read_text().splitlines() == [*lines, "eqrt serve: can1 is back after 3.2 s"]
+    assert out.read_text().count("error: can1 is lost: unplugged\n") == PER_MINUTE
+    assert out.read_text().endswith(" can1 is back after 3.2 s\n")
+
+
+def test_a_lost_bus_is_told_to_machines() -> None:
+    heard = Heard("json")
+    BusTeller(heard.log, io.StringIO())(lost("can0"))
+    (line,) = map(json.loads, heard.lines)
+    expected = {"event": "bus-can0-lost", "level": "error", "channel": "can0", "state": "DOWN"}
+    assert expected.items() <= line.items()
+
+
+def test_a_lost_bus_is_not_told_again_by_the_next_status(quiet: ServiceStatus) -> None:
+    def with_bus(state: str) -> ServiceStatus:
+        bus = BusStatus(channel="can0", state=state, since_s=1.0, overflow=0)
+        return msgspec.structs.replace(quiet, buses=[bus])
+
+    assert told(*map(with_bus, ("UP", "DOWN", "UP", "BUS_OFF", "UP"))) == []
 
 
 def test_sources_that_become_invalid_are_told_with_the_reason(quiet: ServiceStatus) -> None:

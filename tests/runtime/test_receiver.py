@@ -17,7 +17,7 @@ from eqrt.core.errors import AbsentBusError, BusError
 from eqrt.runtime.bus.adapter import Adapter
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.connection import FIRST_RETRY_S, LONGEST_RETRY_S
-from eqrt.runtime.bus.health import BusHealth, BusState, in_sum, trouble
+from eqrt.runtime.bus.health import BusHealth, BusState, BusWord, in_sum, trouble
 from eqrt.runtime.bus.ids import Ids
 from eqrt.runtime.bus.kernel_queue import BATCH, RECEIVE_BYTES, enlarge
 from eqrt.runtime.bus.links import Link, open_link, opener
@@ -25,6 +25,12 @@ from eqrt.runtime.bus.local_bus import LocalBus
 from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.output.publish_can import CanPublisher
 from forecast_sets import many
+
+
+def never_said(word: BusWord) -> None:
+    """Where no channel is lost."""
+    pytest.fail(str(word))
+
 
 CHANNELS = (f"receiver-{number}-{time.monotonic_ns()}" for number in itertools.count())
 PATIENCE_S = 20.0
@@ -74,7 +80,7 @@ def test_messages_of_several_channels_come_with_their_names(interface: str) -> N
     names = [next(CHANNELS), next(CHANNELS)]
     senders = {name: open_bus(name, interface) for name in names}
     wanted: dict[str, Ids | None] = dict.fromkeys(names)
-    with Receiver(opener(interface, fd=None), wanted, pytest.fail) as receiver:
+    with Receiver(opener(interface, fd=None), wanted, never_said) as receiver:
         for i, name in enumerate(names * 2):
             senders[name].send(number(i))
         heard = [receiver.recv(5.0) for _ in range(4)]
@@ -90,7 +96,7 @@ def test_channels_read_in_one_go_come_in_the_order_of_their_times() -> None:
     names = [next(CHANNELS), next(CHANNELS)]
     senders = [open_bus(name, LOCAL) for name in names]
     wanted: dict[str, Ids | None] = dict.fromkeys(names)
-    with Receiver(opener(LOCAL, fd=None), wanted, pytest.fail) as receiver:
+    with Receiver(opener(LOCAL, fd=None), wanted, never_said) as receiver:
         wait_for_stamps(receiver, senders[0])
         for i in range(20):
             senders[i % 2].send(number(i))
@@ -105,7 +111,7 @@ def test_more_than_a_batch_comes_in_order_and_complete() -> None:
     channel, count = next(CHANNELS), 4 * BATCH + 5
     with (
         open_bus(channel, LOCAL) as sender,
-        Receiver(opener(LOCAL, fd=None), {channel: None}, pytest.fail) as receiver,
+        Receiver(opener(LOCAL, fd=None), {channel: None}, never_said) as receiver,
     ):
         before_s = time.time()
         for i in range(count):
@@ -132,8 +138,8 @@ def test_of_the_local_bus_only_wanted_messages_come_and_no_own_ones() -> None:
     ]
     with (
         open_bus(channel, LOCAL) as sender,
-        Receiver(opener(LOCAL, fd=False), {channel: ids}, pytest.fail) as some,
-        Receiver(opener(LOCAL, fd=True), {channel: None}, pytest.fail) as every,
+        Receiver(opener(LOCAL, fd=False), {channel: ids}, never_said) as some,
+        Receiver(opener(LOCAL, fd=True), {channel: None}, never_said) as every,
     ):
         assert isinstance(sender, LocalBus)
         for payload in (b"", b"short", sender._digest, sender._digest + b"1234567", bytes(200)):
@@ -155,7 +161,7 @@ def test_a_signal_does_not_make_the_wait_for_messages_endless(interface: str) ->
     wanted: dict[str, Ids | None] = {next(CHANNELS): None, next(CHANNELS): None}
     fired = []
     before = signal.signal(signal.SIGALRM, lambda *_: fired.append(time.monotonic()))
-    with Receiver(opener(interface, fd=None), wanted, pytest.fail) as receiver:
+    with Receiver(opener(interface, fd=None), wanted, never_said) as receiver:
         signal.setitimer(signal.ITIMER_REAL, 0.0007, 0.0007)
         try:
             for _ in range(500):
@@ -246,7 +252,7 @@ def test_a_lost_channel_comes_back_and_others_do_not_wait_for_it(flaky: Flaky) -
     names, said = [next(CHANNELS), next(CHANNELS)], list[str]()
     wanted: dict[str, Ids | None] = dict.fromkeys(names)
     senders = [open_bus(name, LOCAL) for name in names]
-    with Receiver(flaky.open, wanted, said.append) as receiver:
+    with Receiver(flaky.open, wanted, lambda word: said.append(str(word))) as receiver:
         flaky.refusals, tries = 4, len(flaky.attempts_s)
         flaky.buses[0].shutdown()
         until(receiver, lambda: receiver.health()[0].state is BusState.DOWN)
@@ -339,10 +345,12 @@ def test_what_is_not_there_at_the_start_is_an_error_or_waited_for(flaky: Flaky) 
     channel, said = next(CHANNELS), list[str]()
     flaky.refusals = 1
     with pytest.raises(AbsentBusError, match="no such adapter"):
-        Receiver(flaky.open, {channel: None}, said.append)
+        Receiver(flaky.open, {channel: None}, lambda word: said.append(str(word)))
     flaky.refusals = 2
     with (
-        Receiver(flaky.open, {channel: None}, said.append, wait=True) as receiver,
+        Receiver(
+            flaky.open, {channel: None}, lambda word: said.append(str(word)), wait=True
+        ) as receiver,
         open_bus(channel, LOCAL) as sender,
     ):
         assert receiver.health()[0].reason == "no such adapter"
@@ -359,7 +367,7 @@ def test_a_mistake_is_an_error_even_for_who_waits() -> None:
     """Time does not mend it; and what was opened before is closed."""
     wanted: dict[str, Ids | None] = {next(CHANNELS): None}
     with pytest.raises(BusError, match="no CAN interface 'usbcan'") as caught:
-        Receiver(opener("usbcan", fd=None), wanted, pytest.fail, wait=True)
+        Receiver(opener("usbcan", fd=None), wanted, never_said, wait=True)
     assert not isinstance(caught.value, AbsentBusError)
 
 
@@ -371,7 +379,7 @@ def test_error_frames_of_other_adapters_are_counted_too() -> None:
     )
     with (
         open_bus(channel, "virtual") as sender,
-        Receiver(opener("virtual", fd=None), {channel: None}, pytest.fail) as receiver,
+        Receiver(opener("virtual", fd=None), {channel: None}, never_said) as receiver,
     ):
         sender.send(passive)
         sender.send(number(1))

@@ -18,7 +18,7 @@ import pytest
 from drives import DRIVES, first_seconds, shipped_predictor
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
-from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.bus.health import BusHealth, BusWord
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import load_profile
@@ -29,6 +29,12 @@ from eqrt.runtime.play import OTHERS, Player
 from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Service
 from eqrt.runtime.status_book import StatusBook, status_line
 from forecast_sets import many, nobody, one_car
+
+
+def never_said(word: BusWord) -> None:
+    """Where no channel is lost."""
+    pytest.fail(str(word))
+
 
 CHANNELS = (f"service-{number}-{time.monotonic_ns()}" for number in itertools.count())
 WALL_S = 1.7e9  # any wall-clock time
@@ -184,7 +190,7 @@ def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> 
     lines = first_seconds(DRIVES["ars408"].log, 2.3).splitlines()
     with (
         open_bus(channel, LOCAL) as car,
-        Receiver(opener(LOCAL, fd=None), {channel: None}, pytest.fail) as receiver,
+        Receiver(opener(LOCAL, fd=None), {channel: None}, never_said) as receiver,
     ):
         play = Player({OTHERS: car}).play
         player = threading.Thread(

@@ -32,6 +32,8 @@ def test_a_service_outlives_its_channel_and_says_so(run_on_vcan: RunOnVcan, tmp_
     assert said[4] in ("lost: network is down", "lost: no such device")
     assert len(said) == 5
     lines = found["output"].splitlines()
+    for line in said[1:]:  # the log has it too, and once
+        assert sum(one.endswith(f"vcan5 is {line}") for one in lines) == said[1:].count(line)
     assert any(line.startswith("eqrt serve: ars408 on vcan5") for line in lines)
     assert sum("  vcan5 down for " in line for line in lines) >= 2
     assert lines[-1].endswith("; vcan5: lost 2x")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import can
 
-from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.bus.health import BusHealth, BusWord
 from eqrt.runtime.bus.ids import Ids
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
@@ -68,7 +68,10 @@ class Life:
         self.said: list[str] = []
         self._heard: list[str] = []
         wanted = dict.fromkeys(channels, ids)
-        self.receiver = Receiver(opener(None, fd=None), wanted, self.said.append, wait=wait)
+        self.receiver = Receiver(opener(None, fd=None), wanted, self._note, wait=wait)
+
+    def _note(self, word: BusWord) -> None:
+        self.said.append(str(word))
 
     def heard(self, seconds: float = 0.2) -> list[str]:
         """Channel and data of what comes within that time, or came while it waited."""
@@ -276,7 +279,7 @@ def loopback() -> object:
     """The local bus, whose network is switched off and on: nothing is lost for good."""
     said: list[str] = []
     wanted: dict[str, Ids | None] = {"here": None}
-    receiver = Receiver(opener("eqrt_local", fd=None), wanted, said.append)
+    receiver = Receiver(opener("eqrt_local", fd=None), wanted, lambda word: said.append(str(word)))
     heard = []
     with can.Bus("here", "eqrt_local") as other:
         for step in ("up", "down", "up"):

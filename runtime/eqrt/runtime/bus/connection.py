@@ -12,7 +12,7 @@ from collections.abc import Callable
 import can
 
 from eqrt.core.errors import AbsentBusError, in_one_line
-from eqrt.runtime.bus.health import BusHealth, BusState, told_overrun, told_state
+from eqrt.runtime.bus.health import LOST, BusHealth, BusState, BusWord, told_overrun, told_state
 from eqrt.runtime.bus.links import Link
 
 FIRST_RETRY_S = 0.1
@@ -20,7 +20,6 @@ LONGEST_RETRY_S = 1.0
 """Between attempts to open a channel; also how long one must have been up to start over."""
 _LOOK_S = 0.01  # how often an attempt is asked whether it is over
 _MOST_LEFT = 100_000  # messages; more than any receive queue holds
-_LOST = (BusState.DOWN, BusState.BUS_OFF)
 _REASONS = {
     BusState.ERROR_PASSIVE: "many errors on the bus",
     BusState.BUS_OFF: "bus-off, which is too many errors; the controller stays so until it is "
@@ -36,7 +35,7 @@ class Connection:
         channel: str,
         open_link: Callable[[], Link],
         selector: selectors.BaseSelector,
-        say: Callable[[str], None],
+        say: Callable[[BusWord], None],
     ) -> None:
         """Registers with the selector while open, as data of its key. Call `open` next."""
         self.channel = channel
@@ -65,7 +64,7 @@ class Connection:
         except AbsentBusError as error:
             if not wait:
                 raise
-            self._say(f"waiting for {self.channel}: {error}")
+            self._tell(f"waiting for {self.channel}: {error}")
             self._lost_s, self._reason = self._since_s, f"{error}"
             self._try_later()
 
@@ -177,13 +176,16 @@ class Connection:
         """Change the state, and say so when the channel is lost or back."""
         now_s = time.monotonic()
         self._state, self._since_s, self._reason = state, now_s, reason
-        if state in _LOST and self._lost_s is None:
+        if state in LOST and self._lost_s is None:
             self._lost_s = now_s
-            self._say(f"{self.channel} is lost: {reason}")
-        elif state not in _LOST and self._lost_s is not None:
+            self._tell(f"{self.channel} is lost: {reason}")
+        elif state not in LOST and self._lost_s is not None:
             back = "back" if self._losses or self._bus_offs else "there"
-            self._say(f"{self.channel} is {back} after {now_s - self._lost_s:.1f} s")
+            self._tell(f"{self.channel} is {back} after {now_s - self._lost_s:.1f} s")
             self._lost_s = None
+
+    def _tell(self, text: str) -> None:
+        self._say(BusWord(channel=self.channel, state=self._state, text=text))
 
     def _close(self) -> None:
         if self._link is not None:

@@ -26,6 +26,22 @@ class BusState(Enum):
     """Switched off, unplugged, or not there yet."""
 
 
+LOST = (BusState.DOWN, BusState.BUS_OFF)
+"""States in which nothing is heard."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusWord:
+    """What is said at once, when a channel is lost or back."""
+
+    channel: str
+    state: BusState
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusHealth:
     """One channel, from the start of the service until now."""

@@ -14,7 +14,7 @@ from operator import attrgetter
 import can
 
 from eqrt.runtime.bus.connection import Connection
-from eqrt.runtime.bus.health import BusHealth, BusState
+from eqrt.runtime.bus.health import BusHealth, BusState, BusWord
 from eqrt.runtime.bus.ids import Ids
 from eqrt.runtime.bus.links import OpenLink
 
@@ -26,7 +26,7 @@ class Receiver:
         self,
         open_link: OpenLink,
         channels: Mapping[str, Ids | None],
-        say: Callable[[str], None],
+        say: Callable[[BusWord], None],
         *,
         wait: bool = False,
     ) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TextIO
 
+from eqrt.runtime.bus.health import LOST, BusWord
 from eqrt.runtime.operation.event_log import EventLog, Level
 from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
@@ -18,7 +20,31 @@ MODES = {
     Mode.SILENT: "no input; everything said before is void",
 }
 """A mode in words, for whoever reads the log."""
+_SAID_AT_ONCE = {state.name for state in LOST}  # and being back from there: `BusTeller`
 _GOOD = {Mode.RUN, Mode.NO_MAP, Mode.PARTIAL}
+
+
+class BusTeller:
+    """Says at once that a channel is lost or back: in the log, and on `errors`, if that leads
+    elsewhere, for whoever sees nothing of the log.
+    """
+
+    def __init__(self, log: EventLog, errors: TextIO) -> None:
+        self._log = log
+        self._errors = None if log.goes_to(errors) else errors
+
+    def __call__(self, word: BusWord) -> None:
+        """Say it, as often as the log admits."""
+        is_lost = word.state in LOST
+        said = self._log.say(
+            Level.ERROR if is_lost else Level.INFO,
+            f"bus-{word.channel}-{'lost' if is_lost else 'back'}",
+            word.text,
+            channel=word.channel,
+            state=word.state.name,
+        )
+        if said and self._errors is not None:
+            print(f"eqrt serve: {word.text}", file=self._errors, flush=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +107,8 @@ class Changes:
         )
 
     def _bus(self, before: BusStatus | None, bus: BusStatus) -> None:
-        if bus.state != (before.state if before else "UP"):
+        state_before = before.state if before else "UP"
+        if bus.state != state_before and not {bus.state, state_before} & _SAID_AT_ONCE:
             level = Level.INFO if bus.state == "UP" else Level.ERROR
             text = f"bus {bus.channel} is {bus.state}"
             self._log.say(level, f"bus-{bus.channel}", text, channel=bus.channel, state=bus.state)

@@ -67,17 +67,28 @@ class EventLog:
         self._for_journal = "JOURNAL_STREAM" in environment
         self._windows: dict[str, _Window] = {}
 
-    def say(self, level: Level, event: str, text: str, **fields: Any) -> None:
-        """One event: `event` is its name, by which it is counted; `fields` are for JSON alone."""
+    def say(self, level: Level, event: str, text: str, **fields: Any) -> bool:
+        """One event: `event` is its name, by which it is counted; `fields` are for JSON alone.
+
+        Whether it was written: it was bad enough, and had not been said too often.
+        """
         if level > self._level:
-            return
+            return False
         left_out = self._admit(event)
         if left_out is None:
-            return
+            return False
         if left_out:
             fields["left_out"] = left_out
             text += f" ({left_out} more like it left out)"
         self._write(level, event, text, fields)
+        return True
+
+    def goes_to(self, stream: TextIO) -> bool:
+        """Whether what is written to that stream stands among the log's lines."""
+        try:
+            return os.path.sameopenfile(self._stream.fileno(), stream.fileno())
+        except (OSError, ValueError):  # one of them is no file, or closed
+            return self._stream is stream
 
     def line(self, event: str, text: str, **fields: Any) -> None:
         """A line that is always said: the status of a second, the first and the last one."""

@@ -19,6 +19,7 @@ from eqrt.runtime.bench.resources import Watch, resident_mib
 from eqrt.runtime.bench.schedule import CLOCK
 from eqrt.runtime.bench.service.journal import Journal, NotingPublisher, NotingReceiver
 from eqrt.runtime.bench.service.orders import ServiceOrder, read_order, say, while_wanted
+from eqrt.runtime.bus.health import BusWord
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import load_profile
@@ -59,9 +60,9 @@ def serve(import_ns: int, bare_mib: float) -> None:
         run.tell()
 
 
-def _lost(line: str) -> None:
+def _lost(word: BusWord) -> None:
     """A channel that comes and goes makes no figures."""
-    raise BusError(line)
+    raise BusError(str(word))
 
 
 class AnsweredClock:
