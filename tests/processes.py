@@ -31,10 +31,14 @@ def environment(**more: str) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(ROOT / "runtime")} | more
 
 
-def eqrt(*arguments: str, cwd: Path | None = None, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end; `more` goes into its environment."""
+def eqrt(
+    *arguments: str, cwd: Path | None = None, command: Sequence[str] = EQRT, **more: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; `command`: what to run instead of `eqrt`, `more` goes into its
+    environment.
+    """
     return subprocess.run(
-        [*EQRT, *arguments],
+        [*command, *arguments],
         capture_output=True,
         text=True,
         check=False,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from drives import DRIVES, first_seconds
 from eqrt.runtime.bus.buses import LOCAL
-from processes import PATIENCE_S, Heard, Serving, playing
+from processes import EQRT, PATIENCE_S, Heard, Serving, playing
 
 CHANNELS = (f"record-{number}-{time.monotonic_ns()}" for number in itertools.count())
 SECONDS = 4.0
@@ -24,9 +24,10 @@ def recorded_drive(
     *options: str,
     seconds: float = SECONDS,
     until: int | None = None,
+    command: Sequence[str] = EQRT,
 ) -> Iterator[tuple[Serving, Heard]]:
     """A service that records, and has been played some seconds of a drive, or so much of them
-    that it has sent `until` cycles; then it is still being played.
+    that it has sent `until` cycles; then it is still being played. `command`: as of Serving.
     """
     drive = DRIVES[name]
     channels = {role: next(CHANNELS) for role in drive.roles}
@@ -34,7 +35,8 @@ def recorded_drive(
     log.write_text(first_seconds(drive.log, seconds))
     with Heard(next(CHANNELS)) as heard:
         more = ["--can-interface", LOCAL, "--out-can=none", "--datagrams", heard.address]
-        service = Serving(*cans, *more, *drive.options, "--record", str(folder), *options)
+        arguments = [*cans, *more, *drive.options, "--record", str(folder), *options]
+        service = Serving(*arguments, command=command)
         with service:
             routes = [f"--can={drive.roles[role]}={channel}" for role, channel in channels.items()]
             with playing(log, *routes) as player:

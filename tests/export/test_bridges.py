@@ -32,9 +32,10 @@ from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.recording.identity import attached_files, identity_of
 from eqrt.runtime.recording.json_schemas import json_schema
-from eqrt.runtime.recording.order import Order
+from eqrt.runtime.recording.order import Description, Order
 from eqrt.runtime.recording.reader import Recording, read_recordings
 from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, TapedClock
 from eqrt.runtime.status_book import StatusBook
 from forecast_sets import one_car
@@ -65,8 +66,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     order = Order(
         folder=str(folder),
         run="00c0ffee",
-        identity=identity_of(pipeline, model_folder=Path(), channels=None, stationary=False),
-        attached=attached_files("generic", pipeline),
+        description=Description(
+            identity=identity_of(pipeline, model_folder=Path(), channels=None, stationary=False),
+            attached=attached_files("generic", pipeline),
+        ),
         schemas={"/eqrt/status": json_schema(ServiceStatus), "/eqrt/lost": json_schema(Lost)},
         file_bytes=1 << 30,
         file_seconds=600.0,
@@ -74,7 +77,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         free_bytes=0,
         delete_oldest=False,
     )
-    with Recorder(order, clock) as recorder:
+    with Recorder(order, clock, RunTape()) as recorder:
         book = StatusBook(pipeline, Nowhere(), [recorder])
         for line in first_seconds(NGSIM.log, 2.0).splitlines():
             message = candump_message(line)

@@ -8,14 +8,15 @@ import warnings
 
 import atheris
 
-_INSTRUMENTED = ["eqrt", "can", "cantools", "textparser", "tomllib", "argparse"]
+_INSTRUMENTED = ["eqrt", "can", "cantools", "textparser", "tomllib", "argparse", "mcap"]
 
 
 def main(arguments: list[str]) -> None:
     """Runs until the flags say to end, or something breaks; then the process ends."""
     name, *flags = arguments
     with atheris.instrument_imports(include=_INSTRUMENTED):
-        import cantools.database.can.formats.dbc  # noqa: F401  # eqrt imports it late
+        import cantools.database.can.formats.dbc  # noqa: F401  # eqrt imports these late
+        import mcap.stream_reader  # noqa: F401
 
         from fuzz.targets import ALL  # instrumented while it is imported
     logging.disable()  # python-can prints what it does not understand

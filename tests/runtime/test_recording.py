@@ -29,9 +29,10 @@ from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.recording.folder import recordings_in
 from eqrt.runtime.recording.identity import attached_files, identity_of
-from eqrt.runtime.recording.order import Attached, Order
+from eqrt.runtime.recording.order import Attached, Description, Order
 from eqrt.runtime.recording.reader import Recording, read_recordings
 from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Step, TapedClock
 from eqrt.runtime.service import Service
 from processes import PATIENCE_S, Heard, Serving, eqrt
@@ -146,6 +147,7 @@ def test_foreign_tools_read_it(drives: dict[str, tuple[Path, Heard]]) -> None:
             "/eqrt/forecasts",
             "/eqrt/status",
             "/eqrt/lost",
+            "/eqrt/runs",
         }
         schema = json.loads(summary.schemas[topics["/eqrt/status"].schema_id].data)
         statuses = [json.loads(m.data) for _, _, m in reader.iter_messages("/eqrt/status")]
@@ -309,8 +311,7 @@ def order(folder: Path, identity: dict[str, str], *attached: Attached) -> Order:
     return Order(
         folder=str(folder),
         run="00c0ffee",
-        identity=identity,
-        attached=list(attached),
+        description=Description(identity=identity, attached=list(attached)),
         schemas={"/eqrt/status": b"{}", "/eqrt/lost": b"{}"},
         file_bytes=1 << 30,
         file_seconds=600.0,
@@ -372,7 +373,7 @@ def recorded_traffic(
             return {}
 
     receiver = Traffic(seconds)
-    with Recorder(begun, clock, 1 << 16 if stalled else 1 << 23) as recorder:
+    with Recorder(begun, clock, RunTape(), 1 << 16 if stalled else 1 << 23) as recorder:
         if stalled:
             os.kill(recorder.writer_pid, signal.SIGSTOP)
         service = Service(pipeline, receiver, [Keep(), recorder], clock=Paced(), witness=recorder)
@@ -384,13 +385,10 @@ def recorded_traffic(
 
 
 def replayed(folder: Path) -> list[ForecastSet]:
-    from eqrt.runtime.recording.replaying import Instead, recorded_pipeline, replay_recording
-    from eqrt.runtime.recording.steps import ReplayedClock
+    from eqrt.runtime.recording.replaying import Instead, Replay
 
     (recording,) = read_recordings(folder)
-    clock = ReplayedClock()
-    pipeline = recorded_pipeline(recording, Instead(), clock)
-    return list(replay_recording(recording, pipeline, clock))
+    return list(Replay(recording, Instead()))
 
 
 def test_a_replay_is_as_late_as_the_service_was(tmp_path: Path) -> None:
@@ -482,7 +480,7 @@ def test_a_file_in_a_recording_cannot_lead_elsewhere(tmp_path: Path) -> None:
     identity = identity_of(pipeline, model_folder=Path("x"), channels=None, stationary=False)
     evil = Attached("../../evil", "text/plain", b"x")
     clock = TapedClock(time.monotonic)
-    with Recorder(order(tmp_path, identity, evil), clock) as recorder:
+    with Recorder(order(tmp_path, identity, evil), clock, RunTape()) as recorder:
         recorder.begin(None, 1.0)
         recorder.end()
     with pytest.raises(LogError, match="leads elsewhere"):
@@ -515,4 +513,4 @@ def start_in(folder: Path) -> None:
     add_record_arguments(parser)
     args = parser.parse_args(["--record", str(folder)])
     pipeline = Pipeline(load_profile("generic"), shipped_predictor())
-    start_recorder(args, pipeline, None, TapedClock(time.monotonic))
+    start_recorder(args, pipeline, None, TapedClock(time.monotonic), RunTape())

@@ -27,7 +27,7 @@ from eqrt.runtime.prediction.guard import Guarded, guard
 from eqrt.runtime.prediction.modes import ModeKeeper
 from eqrt.runtime.prediction.targets import Targets
 from eqrt.runtime.prediction.tiles import Tile
-from eqrt.runtime.prediction.watched import Direct, Model, Watched
+from eqrt.runtime.prediction.watched import Direct, Model, Runner, Watched
 from eqrt.runtime.tracking.ego import EgoState, EgoTracker
 from eqrt.runtime.tracking.tracks import TrackStore
 
@@ -95,11 +95,13 @@ class Pipeline:
         channels: Mapping[str, str | int] | None = None,
         stationary: bool = False,
         clock: Callable[[], float] | None = None,
+        run_by: Callable[[Model], Runner] | None = None,
     ) -> None:
         """`channels`: role of a bus in the profile -> channel; None = every role is anywhere.
 
         `stationary`: the sensor stands still, and nothing on the bus says so. `clock` tells the
-        pipeline's time while it computes; None = no time passes (replay).
+        pipeline's time while it computes; None = no time passes (replay). `run_by` makes what runs
+        the model; None = Watched with a clock, Direct without.
         """
         self.decoder = Decoder(profile, channels, tile.info.origin_deg if tile else None)
         self.ego = EgoTracker(
@@ -113,7 +115,8 @@ class Pipeline:
         self.predictor = predictor
         self.tile = tile
         self._clock = clock
-        self._runner = Direct(predictor) if clock is None else Watched(predictor)
+        run_by = run_by or (Direct if clock is None else Watched)
+        self._runner = run_by(predictor)
         self._forecaster = Forecaster(
             predictor.contract, self._runner, lanes_for(tile, predictor), self.tracks, self.ego
         )

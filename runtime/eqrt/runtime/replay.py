@@ -13,7 +13,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,20 +28,22 @@ from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.recording.reader import is_recording, read_recordings
-from eqrt.runtime.recording.replaying import Instead, recorded_pipeline, replay_recording
-from eqrt.runtime.recording.steps import ReplayedClock
+from eqrt.runtime.recording.replaying import Instead, LeftOut, Replay
 from eqrt.runtime.run_diff import compare_runs, table
 from eqrt.runtime.serve import load_pipeline
 from eqrt.runtime.serve_options import add_pipeline_arguments
 
 DIFFERS = 1
+PARTLY = 3
+"""Some cycles of the recording cannot be made again; the others are as they should be."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt replay`."""
     parser.epilog = (
         "example: eqrt replay drive.log --profile ars408 --out predictions.jsonl. Exit status with "
-        "--diff: 0 the runs are identical, 1 they differ"
+        "--diff: 0 the runs are identical, 1 they differ. 3: some cycles of a recording cannot be "
+        "made again and are left out, because their model is not here; all else is well"
     )
     parser.add_argument(
         "log",
@@ -93,12 +95,14 @@ def run(args: argparse.Namespace) -> int:
                 pass
             status = 0
         else:
-            status = _compare(args, lines)
+            status = _compare(args, lines, replayed)
     seconds = time.perf_counter() - started_s
     if replayed.remark:
         print(f"eqrt: {replayed.remark}", file=sys.stderr)
+    for part in replayed.left_out:
+        print(f"eqrt: {part}", file=sys.stderr)
     print(f"eqrt replay: {replayed.summary()} in {seconds:.1f} s", file=sys.stderr)
-    return status
+    return PARTLY if status == 0 and replayed.left_out else status
 
 
 def _written(replayed: _LogReplay | _RecordingReplay, out: BinaryIO) -> Iterator[bytes]:
@@ -109,14 +113,16 @@ def _written(replayed: _LogReplay | _RecordingReplay, out: BinaryIO) -> Iterator
         yield from lines.splitlines()
 
 
-def _compare(args: argparse.Namespace, lines: Iterator[bytes]) -> int:
+def _compare(
+    args: argparse.Namespace, lines: Iterator[bytes], replayed: _LogReplay | _RecordingReplay
+) -> int:
     if args.diff is not None:
         other, name = _lines_of(args.diff), args.diff.name
     else:
-        forecasts = _replay_of(args, args.diff_model)
+        forecasts = _replay_of(args, args.diff_model, everywhere=True)
         other = (line for forecast in forecasts for line in json_lines(forecast).splitlines())
         name = args.diff_model.name
-    found = compare_runs(lines, other)
+    found = compare_runs(lines, other, replayed.is_left_out)
     text = table(found, "the replay", name)
     print(text, end="", file=sys.stderr if args.out == "-" else sys.stdout)
     if found.is_none:
@@ -142,14 +148,19 @@ def _lines_of(run: Path) -> Iterator[bytes]:
         ) from error
 
 
-def _replay_of(args: argparse.Namespace, model: Path | None) -> _LogReplay | _RecordingReplay:
+def _replay_of(
+    args: argparse.Namespace, model: Path | None, *, everywhere: bool = False
+) -> _LogReplay | _RecordingReplay:
+    """`everywhere`: the model predicts all of a recording, even if it was made with it in part."""
     if is_recording(args.log):
-        return _RecordingReplay(args, model)
+        return _RecordingReplay(args, model, everywhere=everywhere)
     return _LogReplay(args, model)
 
 
 class _LogReplay:
     """A log, on the clock of its stamps."""
+
+    left_out: Sequence[LeftOut] = ()
 
     def __init__(self, args: argparse.Namespace, model: Path | None) -> None:
         """Raises UsageError, LogError, and what loading profile, model and tile raises."""
@@ -164,6 +175,11 @@ class _LogReplay:
     def __iter__(self) -> Iterator[ForecastSet]:
         return replay(self._pipeline, self._log)
 
+    def is_left_out(self, time_s: float) -> bool:
+        """A log is replayed whole."""
+        del time_s
+        return False
+
     @property
     def remark(self) -> str | None:
         """What could not be read."""
@@ -177,31 +193,32 @@ class _LogReplay:
 class _RecordingReplay:
     """Recordings, each on the clock of the service that made it."""
 
-    def __init__(self, args: argparse.Namespace, model: Path | None) -> None:
+    def __init__(self, args: argparse.Namespace, model: Path | None, *, everywhere: bool) -> None:
         """Raises LogError."""
         self._recordings = read_recordings(args.log)
         self._args = args
-        self._model = model
-        self._pipelines: list[Pipeline] = []
+        self._model = None if everywhere else model
+        self._other_model = model if everywhere else None
+        self._replays: list[Replay] = []
 
     def __iter__(self) -> Iterator[ForecastSet]:
         notices: set[str | None] = {None}
         for recording in self._recordings:
-            clock = ReplayedClock()
-            pipeline = recorded_pipeline(recording, self._instead(), clock)
-            model = pipeline.predictor
+            replayed = Replay(recording, self._instead())
+            model = replayed.pipeline.predictor
             notice = model.license_notice if isinstance(model, Predictor) else None
             if notice not in notices:
                 print(f"eqrt: {notice}", file=sys.stderr)
                 notices.add(notice)
-            self._pipelines.append(pipeline)
-            yield from replay_recording(recording, pipeline, clock)
+            self._replays.append(replayed)
+            yield from replayed
 
     def _instead(self) -> Instead:
         args = self._args
         return Instead(
             profile=args.profile,
             model=self._model,
+            other_model=self._other_model,
             tile=args.tile,
             can=tuple(args.can),
             stationary=args.stationary,
@@ -215,9 +232,19 @@ class _RecordingReplay:
             remarks.append("after what is missing, predictions may differ from those made then")
         return "; ".join(remarks) or None
 
+    @property
+    def left_out(self) -> list[LeftOut]:
+        """Cycles that cannot be made again, so far."""
+        return [part for one in self._replays for part in one.left_out if part.times_s]
+
+    def is_left_out(self, time_s: float) -> bool:
+        """Whether a cycle, at that time in JSON lines, is one of them."""
+        return any(time_s in part.times_s for part in self.left_out)
+
     def summary(self) -> str:
         """What went in and came out."""
-        return _summary(sum(one.messages for one in self._recordings), self._pipelines)
+        pipelines = [one.pipeline for one in self._replays]
+        return _summary(sum(one.messages for one in self._recordings), pipelines)
 
 
 def _summary(messages: int, pipelines: list[Pipeline]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import msgspec
@@ -74,6 +74,8 @@ class Difference:
     """In both, with targets."""
     cycles_only_first: int = 0
     cycles_only_second: int = 0
+    cycles_left_out: int = 0
+    """Only in the second, because the first cannot say what they were: no difference."""
     targets: int = 0
     """In both."""
     targets_only_first: int = 0
@@ -104,8 +106,16 @@ class Difference:
         return not alone and self.identical == self.targets
 
 
-def compare_runs(first: Iterable[bytes], second: Iterable[bytes]) -> Difference:
-    """The difference of two runs, each given as its JSON lines. Raises LogError on another line."""
+def compare_runs(
+    first: Iterable[bytes],
+    second: Iterable[bytes],
+    is_left_out: Callable[[float], bool] = lambda _: False,
+) -> Difference:
+    """The difference of two runs, each given as its JSON lines. Raises LogError on another line.
+
+    `is_left_out` tells of the time of a cycle whether the first run lacks it with good reason; it
+    is asked when the first run has got past that time.
+    """
     found = Difference()
     firsts = _cycles(first, "the first run", (found.model_ids[0], found.tile_ids[0]))
     seconds = _cycles(second, "the second run", (found.model_ids[1], found.tile_ids[1]))
@@ -117,13 +127,20 @@ def compare_runs(first: Iterable[bytes], second: Iterable[bytes]) -> Difference:
             found.targets_only_first += len(one.targets)
             one = next(firsts, None)
         elif one is None or other.at < one.at:
-            found.cycles_only_second += 1
-            found.targets_only_second += len(other.targets)
+            _count_second(other, found, is_left_out)
             other = next(seconds, None)
         else:
             _compare_cycles(one, other, found)
             one, other = next(firsts, None), next(seconds, None)
     return found
+
+
+def _count_second(cycle: _Cycle, found: Difference, is_left_out: Callable[[float], bool]) -> None:
+    if is_left_out(cycle.at[1]):
+        found.cycles_left_out += 1
+    else:
+        found.cycles_only_second += 1
+        found.targets_only_second += len(cycle.targets)
 
 
 def table(found: Difference, first: str, second: str) -> str:
@@ -139,6 +156,8 @@ def table(found: Difference, first: str, second: str) -> str:
         ("  identical", found.identical),
         ("  with another mode", found.modes),
     ]
+    if found.cycles_left_out:
+        rows.insert(3, (f"  left out of {first}", found.cycles_left_out))
     if found.incomparable:
         rows.append(("  with other time steps", found.incomparable))
     width = max(len(name) for name, _ in rows)

@@ -16,7 +16,7 @@ from eqrt.runtime.bus.ids import Ids
 from eqrt.runtime.bus.links import opener
 from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import Profile, load_profile
-from eqrt.runtime.operation.changes import Changes
+from eqrt.runtime.operation.changes import BusTeller, Changes
 from eqrt.runtime.operation.endpoint import Endpoint
 from eqrt.runtime.operation.event_log import LEVELS, EventLog, Level
 from eqrt.runtime.operation.realtime import Realtime, Sweeper, parse_cpus, refuse
@@ -29,8 +29,11 @@ from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.prediction.watched import Model, Runner, Watched
+from eqrt.runtime.recording.identity import exchanged
 from eqrt.runtime.recording.options import start_recorder
 from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.runs import RunTape, TapedRunner
 from eqrt.runtime.recording.steps import TapedClock
 from eqrt.runtime.serve_options import NO_CHANNEL, add_arguments
 from eqrt.runtime.service import Chore, Observer, Publisher, Service
@@ -46,6 +49,7 @@ def load_pipeline(
     profile: Profile,
     channels: dict[str, str] | None,
     clock: Callable[[], float] | None,
+    run_by: Callable[[Model], Runner] | None = None,
 ) -> Pipeline:
     """The pipeline that `add_pipeline_arguments` describes; the others are as for Pipeline."""
     predictor = Predictor.load(args.model)
@@ -58,6 +62,7 @@ def load_pipeline(
         channels=channels,
         stationary=args.stationary,
         clock=clock,
+        run_by=run_by,
     )
 
 
@@ -79,18 +84,21 @@ def _serve(args: argparse.Namespace) -> int:
         is_asked = stack.enter_context(asked_to_reload())
         _become_realtime(args, log)
         heard = sorted(set(channels.values()))
-        receiver = stack.enter_context(_receiver(args, profile, heard))
+        receiver = stack.enter_context(_receiver(args, profile, heard, log))
         several = channels if len(heard) > 1 else None
-        clock = TapedClock(time.monotonic) if args.record else None
-        pipeline = load_pipeline(args, profile, several, clock=clock or time.monotonic)
+        pipeline, recorder = _pipeline(args, profile, several, stack)
         publishers = _publishers(args, receiver, stack)
-        recorder = None
-        if clock:
-            recorder = stack.enter_context(start_recorder(args, pipeline, several, clock))
+        if recorder is not None:
             publishers.append(recorder)
         manager = stack.enter_context(ServiceManager.of())
         reloader = Reloader(
-            pipeline, args.model, args.tile, is_asked=is_asked, log=log, tell=manager.reload
+            pipeline,
+            args.model,
+            args.tile,
+            is_asked=is_asked,
+            log=log,
+            tell=manager.reload,
+            exchanged=_noted(pipeline, recorder),
         )
         endpoint = _endpoint(args, stack)
         observers, chores = _surroundings(
@@ -115,6 +123,34 @@ def _serve(args: argparse.Namespace) -> int:
         troubles = in_sum(receiver.health())
     log.line("end", f"eqrt serve: {_summary(pipeline)}" + (f"; {troubles}" if troubles else ""))
     return 0
+
+
+def _pipeline(
+    args: argparse.Namespace,
+    profile: Profile,
+    channels: dict[str, str] | None,
+    stack: contextlib.ExitStack,
+) -> tuple[Pipeline, Recorder | None]:
+    """The pipeline, and who records what decides its predictions, if it is to be recorded."""
+    if not args.record:
+        return load_pipeline(args, profile, channels, clock=time.monotonic), None
+    clock, runs = TapedClock(time.monotonic), RunTape()
+
+    def taped(model: Model) -> Runner:
+        return TapedRunner(Watched(model), runs)
+
+    pipeline = load_pipeline(args, profile, channels, clock=clock, run_by=taped)
+    return pipeline, stack.enter_context(start_recorder(args, pipeline, channels, clock, runs))
+
+
+def _noted(pipeline: Pipeline, recorder: Recorder | None) -> Callable[[], None]:
+    """Has the recording say that the pipeline has got another tile or model."""
+
+    def note() -> None:
+        if recorder is not None:
+            recorder.describe(exchanged(recorder.description, pipeline))
+
+    return note
 
 
 def _become_realtime(args: argparse.Namespace, log: EventLog) -> None:
@@ -157,12 +193,15 @@ def _surroundings(
     return observers, chores
 
 
-def _receiver(args: argparse.Namespace, profile: Profile, channels: Sequence[str]) -> Receiver:
+def _receiver(
+    args: argparse.Namespace, profile: Profile, channels: Sequence[str], log: EventLog
+) -> Receiver:
     """Reads `channels`, and opens the one that predictions go to, if it is another, for sending."""
     wanted: dict[str, Ids | None] = dict.fromkeys(channels, profile.ids)
     if (out := _out_channel(args)) is not None:
         wanted.setdefault(out, ())
-    return Receiver(opener(args.can_interface, fd=args.fd), wanted, _warn, wait=args.wait_for_bus)
+    say = BusTeller(log, sys.stderr)
+    return Receiver(opener(args.can_interface, fd=args.fd), wanted, say, wait=args.wait_for_bus)
 
 
 def _out_channel(args: argparse.Namespace) -> str | None:
@@ -213,10 +252,6 @@ class _Teller:
             messages=status.messages,
             latency_ms=[round(1e3 * latency_s, 2) for latency_s in status.latencies_s],
         )
-
-
-def _warn(line: str) -> None:
-    print(f"eqrt serve: {line}", file=sys.stderr, flush=True)
 
 
 def _summary(pipeline: Pipeline) -> str:

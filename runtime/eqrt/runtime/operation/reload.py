@@ -40,9 +40,11 @@ class Reloader:
         is_asked: Callable[[], bool],
         log: EventLog,
         tell: Callable[[bool], None] = lambda _: None,
+        exchanged: Callable[[], None] = lambda: None,
     ) -> None:
         """`is_asked` tells once for every time that somebody asked to load the files anew.
 
+        `exchanged` is called when the pipeline has got another tile or model.
         `tell(True)` is called when loading begins, `tell(False)` when it has ended.
         """
         self._pipeline = pipeline
@@ -50,6 +52,7 @@ class Reloader:
         self._is_asked = is_asked
         self._log = log
         self._tell = tell
+        self._exchanged = exchanged
         self._thread: threading.Thread | None = None
         self._result: _Loaded | str = ""
 
@@ -88,6 +91,7 @@ class Reloader:
             self._log.say(Level.INFO, "reload", f"reloaded: unchanged, {after}")
             return
         self._pipeline.exchange(result.predictor, result.tile, result.lanes)
+        self._exchanged()
         self._log.say(Level.INFO, "reload", f"reloaded: {after}, before {before}")
 
 

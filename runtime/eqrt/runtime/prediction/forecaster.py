@@ -19,7 +19,7 @@ from eqrt.core.scene import (
 )
 from eqrt.runtime.prediction.predictor import Prediction
 from eqrt.runtime.prediction.targets import Bool, Float64, Targets
-from eqrt.runtime.prediction.watched import Direct, Failed, TooLate, Watched
+from eqrt.runtime.prediction.watched import Failed, Runner, TooLate
 from eqrt.runtime.tracking.ego import EgoState, EgoTracker
 from eqrt.runtime.tracking.tracks import Tracks, TrackStore
 
@@ -85,7 +85,7 @@ class Forecaster:
     def __init__(
         self,
         contract: ModelContract,
-        runner: Direct | Watched,
+        runner: Runner,
         lanes: CenterlineSource | None,
         tracks: TrackStore,
         ego: EgoTracker,

@@ -39,6 +39,28 @@ class Model(Protocol):
         """The same model, loaded anew. Raises EqrtError."""
 
 
+class Runner(Protocol):
+    """Runs a model in some way."""
+
+    @property
+    def errors(self) -> int:
+        """Runs that raised."""
+
+    @property
+    def overruns(self) -> int:
+        """Runs that were given up."""
+
+    @property
+    def restarts(self) -> int:
+        """Times that the model was loaded anew."""
+
+    def run(self, scene: Scene, patience_s: float) -> Prediction:
+        """Predict within `patience_s`. Raises Failed, or TooLate."""
+
+    def succeeded_by(self, model: Model) -> Runner:
+        """One for another model, which counts on; this one is not used any more."""
+
+
 class Failed(Exception):  # noqa: N818  # an outcome, which the caller expects
     """The model said nothing."""
 
@@ -128,10 +150,10 @@ class Watched:
             self._successor = _Successor(self._model)
 
 
-Runner = TypeVar("Runner", Direct, Watched)
+Counting = TypeVar("Counting", Direct, Watched)
 
 
-def _counting_on(before: Runner, after: Runner) -> Runner:
+def _counting_on(before: Counting, after: Counting) -> Counting:
     after.errors, after.overruns, after.restarts = before.errors, before.overruns, before.restarts
     return after
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from eqrt.core.errors import LogError
 from eqrt.runtime.recording.topics import NAMES, PROFILE, Topic
 
 _TOPICS = {name: topic for topic, name in NAMES.items()}
-_MAX_RECORD_BYTES = 1 << 30  # far above any chunk of ours: a damaged length is no reason to wait
-_MAX_CHUNK_BYTES = 1 << 28
+_MAX_RECORD_BYTES = 1 << 28  # far above any tile: a damaged length is no reason to wait
+_MAX_ATTACHED_BYTES = 1 << 28  # of all files that travel in a recording
+_MAX_CHUNK_BYTES = 1 << 24  # unpacked; ours are closed at 1 MiB, and may have a second's rest
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ZSTD_HEAD_BYTES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,8 @@ def read_head(stream: IO[bytes], where: str) -> Head:
             identity |= record.metadata
         elif isinstance(record, Attachment):
             attached[record.name] = record.data
+            if sum(map(len, attached.values())) > _MAX_ATTACHED_BYTES:
+                raise LogError(f"{where}: has files of more than {_MAX_ATTACHED_BYTES} bytes in it")
         elif isinstance(record, Chunk):
             break
     if not identity:
@@ -64,7 +68,7 @@ def read_entries(stream: IO[bytes], where: str, end_early: Callable[[str], None]
             continue
         try:
             records = _opened(chunk)
-        except _damages() as error:
+        except ValueError as error:
             return end_early(f"a chunk is damaged ({_reason(error)})")
         for record in records:
             if isinstance(record, Channel):
@@ -81,14 +85,15 @@ def _records(stream: IO[bytes], where: str, end_early: Callable[[str], None]) ->
     from mcap.records import Footer, Header  # noqa: PLC0415
     from mcap.stream_reader import StreamReader  # noqa: PLC0415
 
-    records = StreamReader(stream, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records
+    bounded = cast(IO[bytes], _Bounded(stream))  # of which the reader wants `read` alone
+    records = StreamReader(bounded, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records
     count = 0
     while True:
         try:
             record = next(records)
         except StopIteration:
             return
-        except _damages() as error:
+        except Exception as error:  # whatever the library stumbles over, as in _opened
             if not count:
                 raise LogError(f"{where}: is no MCAP file ({_reason(error)})") from error
             return end_early(f"ends early ({_reason(error)})")
@@ -103,23 +108,55 @@ def _records(stream: IO[bytes], where: str, end_early: Callable[[str], None]) ->
             return
 
 
+class _Bounded:
+    """A stream that is asked for no more than a record can have, whatever a damaged file says."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+
+    def read(self, size: int) -> bytes:
+        if not 0 <= size <= _MAX_RECORD_BYTES:
+            raise ValueError(f"{size} bytes in a record")
+        return self._stream.read(size)
+
+
 def _opened(chunk: Any) -> list[Any]:
+    """The records in a chunk. Raises ValueError if it is damaged, or would be too large."""
     from mcap.stream_reader import breakup_chunk  # noqa: PLC0415 (see _records)
 
-    if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
-        raise ValueError(f"{chunk.uncompressed_size} bytes in a chunk")
+    _check_size(chunk)
     try:
         return list(breakup_chunk(chunk, validate_crc=True))
     except Exception as error:  # whatever the library, or what unpacks for it, stumbles over
         raise ValueError(_reason(error)) from error
 
 
-def _damages() -> tuple[type[Exception], ...]:
-    """What the libraries raise on bytes that are not as they should be."""
-    from mcap.exceptions import McapError  # noqa: PLC0415 (see _records)
+def _check_size(chunk: Any) -> None:
+    """Before anything is unpacked: what it says of its size, twice, and what eqrt never writes."""
+    size = chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        size = max(size, _zstd_bytes(chunk.data))
+    elif chunk.compression:
+        raise ValueError(f"packed as {chunk.compression!r}, which eqrt does not write")
+    else:
+        size = len(chunk.data)
+    if size > _MAX_CHUNK_BYTES:
+        raise ValueError(f"{size} bytes in a chunk")
 
-    return (McapError, struct.error, ValueError, MemoryError)
+
+def _zstd_bytes(packed: bytes) -> int:
+    """What a frame says that it unpacks to (RFC 8878, 3.1.1.1); the library allocates as much.
+
+    0 if it does not say: then the chunk's own size is the library's limit.
+    """
+    if len(packed) < _ZSTD_HEAD_BYTES or packed[:4] != _ZSTD_MAGIC:
+        return 0
+    kind = packed[4]
+    is_single = kind >> 5 & 1
+    at = 5 + (1 - is_single) + (0, 1, 2, 4)[kind & 3]
+    length = (is_single, 2, 4, 8)[kind >> 6]
+    return int.from_bytes(packed[at : at + length], "little") + 256 * (length == 2)
 
 
 def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or "in the middle of a record"
+    return " ".join(str(error).split())[:200] or "in the middle of a record"

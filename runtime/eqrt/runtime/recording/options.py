@@ -14,8 +14,9 @@ from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.recording.folder import free_bytes, total_bytes
 from eqrt.runtime.recording.identity import attached_files, identity_of
 from eqrt.runtime.recording.json_schemas import json_schema
-from eqrt.runtime.recording.order import Order
+from eqrt.runtime.recording.order import Description, Order
 from eqrt.runtime.recording.recorder import Recorder
+from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, TapedClock
 from eqrt.runtime.recording.topics import NAMES, Topic
 
@@ -76,21 +77,23 @@ def start_recorder(
     pipeline: Pipeline,
     channels: Mapping[str, str] | None,
     clock: TapedClock,
+    runs: RunTape,
 ) -> Recorder:
     """The recorder that the options describe, its writer started.
 
-    `channels` and `clock` are those of the pipeline. Raises RecordingError if nothing can be
-    written there.
+    `channels`, `clock` and `runs` are those of the pipeline. Raises RecordingError if nothing can
+    be written there.
     """
     _check(args)
-    identity = identity_of(
-        pipeline, model_folder=args.model, channels=channels, stationary=args.stationary
-    )
     order = Order(
         folder=str(args.record.absolute()),
         run=secrets.token_hex(4),
-        identity=identity,
-        attached=attached_files(args.profile, pipeline),
+        description=Description(
+            identity=identity_of(
+                pipeline, model_folder=args.model, channels=channels, stationary=args.stationary
+            ),
+            attached=attached_files(args.profile, pipeline),
+        ),
         schemas={
             NAMES[Topic.STATUS]: json_schema(ServiceStatus),
             NAMES[Topic.LOST]: json_schema(Lost),
@@ -101,7 +104,7 @@ def start_recorder(
         free_bytes=args.record_keep_free,
         delete_oldest=args.record_when_full == "delete-oldest",
     )
-    return Recorder(order, clock)
+    return Recorder(order, clock, runs)
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -10,7 +10,16 @@ class Attached(msgspec.Struct, frozen=True):
 
     name: str
     media_type: str
-    content: bytes
+    content: bytes = b""
+    path: str = ""
+    """Where the writer is to read it, if not "": what is large is none of the service's work."""
+
+
+class Description(msgspec.Struct, frozen=True, kw_only=True):
+    """What a file of a recording says of itself."""
+
+    identity: dict[str, str]
+    attached: list[Attached]
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
@@ -19,8 +28,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     folder: str
     run: str
     """Eight hexadecimal digits, in the name of every file of this run."""
-    identity: dict[str, str]
-    attached: list[Attached]
+    description: Description
     schemas: dict[str, bytes]
     """Topic -> the JSON schema of its messages."""
     file_bytes: int

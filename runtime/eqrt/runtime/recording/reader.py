@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Protocol, TypeVar
+from typing import IO, Annotated, Protocol, TypeVar
 
 import can
 import msgspec
@@ -21,20 +21,38 @@ from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.exact_forecasts import decode_forecasts
 from eqrt.runtime.recording.folder import SUFFIX, part_of, recordings_in, run_of
-from eqrt.runtime.recording.identity import Identity, read_identity
+from eqrt.runtime.recording.identity import Identity, one_line, read_identity
 from eqrt.runtime.recording.mcap_entries import Head, Raw, read_entries, read_head
-from eqrt.runtime.recording.steps import CanEntry, Lost, PollEntry, Step, can_message
+from eqrt.runtime.recording.steps import (
+    MAX_TIME_S,
+    CanEntry,
+    Lost,
+    PollEntry,
+    Step,
+    Time,
+    can_message,
+)
 from eqrt.runtime.recording.topics import FORMAT_VERSION, Topic
 
-Entry = Step | ForecastSet | ServiceStatus | Lost
-"""What stands in a recording; a `Step` comes with its clock."""
+
+@dataclass(frozen=True, slots=True)
+class Exchanged:
+    """Another model or tile, or both, predict from here on."""
+
+    identity: Identity
+    attached: dict[str, bytes]
+
+
+Entry = Step | ForecastSet | ServiceStatus | Lost | Exchanged
+"""What stands in a recording; a `Step` comes with its clock and the outcomes of its runs."""
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 EVERYTHING = frozenset(Topic)
-_STEPS = frozenset({Topic.CAN, Topic.POLL, Topic.CLOCK})
+_STEPS = frozenset({Topic.CAN, Topic.POLL, Topic.CLOCK, Topic.RUNS})
 _CAN = msgspec.msgpack.Decoder(CanEntry)
 _POLL = msgspec.msgpack.Decoder(PollEntry)
-_CLOCK = msgspec.msgpack.Decoder(tuple[float, ...])
+_CLOCK = msgspec.msgpack.Decoder(tuple[Time, ...])
+_RUNS = msgspec.msgpack.Decoder(tuple[Annotated[int, msgspec.Meta(ge=0, le=2)], ...])
 _STATUS = msgspec.json.Decoder(ServiceStatus)
 _LOST = msgspec.json.Decoder(Lost)
 
@@ -79,9 +97,14 @@ class Recording:
         return self._head.attached
 
     @cached_property
+    def identities(self) -> list[Identity]:
+        """What each file says that it is of: models and tiles are exchanged between two files."""
+        return [_identity(_head(path), path) for path in self.paths]
+
+    @cached_property
     def gaps(self) -> list[str]:
         """What is missing of the run's files."""
-        parts = [int(_identity(_head(path), path).part) for path in self.paths]
+        parts = [int(identity.part) for identity in self.identities]
         gaps = [f"begins in the middle of its run, with part {parts[0]}"] if parts[0] else []
         return gaps + [
             f"part {before + 1} is missing"
@@ -106,12 +129,22 @@ class Recording:
         self._reset()
         waiting: list[Recorded] = []
         for raw in self._raw():
+            if isinstance(raw, Exchanged):
+                if topics >= _STEPS:
+                    yield from waiting
+                    waiting = [Recorded(waiting[-1].log_ns if waiting else 0, raw)]
+                continue
             if raw.topic is Topic.LOST:
-                self.lost += _decoded(_LOST, raw.payload, self).steps
+                self.lost += _decoded(_LOST, raw.payload, self.paths[0]).steps
             if raw.topic not in topics:
                 continue
             if raw.topic is Topic.CLOCK:
-                _add_clock(waiting, _decoded(_CLOCK, raw.payload, self))
+                said_s = _decoded(_CLOCK, raw.payload, self.paths[0])
+                _add(waiting, clock_s=said_s)
+                continue
+            if raw.topic is Topic.RUNS:
+                outcomes = _decoded(_RUNS, raw.payload, self.paths[0])
+                _add(waiting, outcomes=outcomes)
                 continue
             if raw.topic in _STEPS:  # what the clock said during the one before is complete
                 yield from waiting
@@ -127,8 +160,12 @@ class Recording:
         """All that it predicted. Raises LogError if it cannot be read."""
         return _only(ForecastSet, self.entries(frozenset({Topic.FORECASTS})))
 
-    def _raw(self) -> Iterator[Raw]:
-        for path in self.paths:
+    def _raw(self) -> Iterator[Raw | Exchanged]:
+        predicting = self.identity.predicting
+        for path, identity in zip(self.paths, self.identities, strict=True):
+            if identity.predicting != predicting:
+                predicting = identity.predicting
+                yield Exchanged(identity, _head(path).attached)
 
             def end_early(what: str, name: str = path.name) -> None:
                 self.cut.append(f"{name} {what}, read up to there")
@@ -142,18 +179,18 @@ class Recording:
     def _entry(self, raw: Raw) -> Entry:
         if raw.topic is Topic.CAN:
             self.messages += 1
-            entry = _decoded(_CAN, raw.payload, self)
+            entry = _decoded(_CAN, raw.payload, self.paths[0])
             return Step(entry.now_s, can_message(entry))
         if raw.topic is Topic.POLL:
-            return Step(_decoded(_POLL, raw.payload, self).now_s, None)
+            return Step(_decoded(_POLL, raw.payload, self.paths[0]).now_s, None)
         if raw.topic is Topic.STATUS:
-            return _decoded(_STATUS, raw.payload, self)
+            return _decoded(_STATUS, raw.payload, self.paths[0])
         if raw.topic is Topic.LOST:
-            return _decoded(_LOST, raw.payload, self)
+            return _decoded(_LOST, raw.payload, self.paths[0])
         try:
             return decode_forecasts(raw.payload)
         except ValueError as error:
-            raise LogError(f"{self.paths[0]}: {error}") from error
+            raise LogError(f"{self.paths[0]}: {in_one_line(error)}") from error
 
 
 def read_recordings(path: Path) -> list[Recording]:
@@ -183,26 +220,31 @@ def can_messages(stream: IO[bytes], reader: LogReader) -> Iterator[can.Message]:
     """The CAN messages of one file, at their own stamps: a log like any other."""
     for raw in read_entries(stream, str(reader.path), reader.end_early):
         if raw.topic is Topic.CAN:
-            yield can_message(_CAN.decode(raw.payload))
+            entry = _decoded(_CAN, raw.payload, reader.path)
+            if not abs(entry.stamp_s) <= MAX_TIME_S:
+                raise LogError(f"{reader.path}: a message is stamped {entry.stamp_s}, no time")
+            yield can_message(entry)
 
 
-def _add_clock(waiting: list[Recorded], said_s: tuple[float, ...]) -> None:
+def _add(
+    waiting: list[Recorded], *, clock_s: tuple[float, ...] = (), outcomes: tuple[int, ...] = ()
+) -> None:
     """To the step that waits, which is the first; before the first step there is nothing to do."""
     if waiting and isinstance(step := waiting[0].entry, Step):
-        waiting[0] = replace(waiting[0], entry=replace(step, clock_s=step.clock_s + said_s))
+        more = replace(step, clock_s=step.clock_s + clock_s, outcomes=step.outcomes + outcomes)
+        waiting[0] = replace(waiting[0], entry=more)
 
 
 def _only(kind: type[T], recorded: Iterator[Recorded]) -> Iterator[T]:
     return (one.entry for one in recorded if isinstance(one.entry, kind))
 
 
-def _decoded(decoder: _Decoder[T], payload: bytes, recording: Recording) -> T:
+def _decoded(decoder: _Decoder[T], payload: bytes, path: Path) -> T:
+    """Raises LogError."""
     try:
         return decoder.decode(payload)
-    except msgspec.MsgspecError as error:
-        raise LogError(
-            f"{recording.paths[0]}: an entry cannot be read ({in_one_line(error)})"
-        ) from error
+    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+        raise LogError(f"{path}: an entry cannot be read ({in_one_line(error)})") from error
 
 
 def _head(path: Path) -> Head:
@@ -217,7 +259,7 @@ def _identity(head: Head, path: Path) -> Identity:
     identity = read_identity(head.identity, path)
     if identity.format != str(FORMAT_VERSION):
         raise LogError(
-            f"{path}: is of format {identity.format}, this version of eqrt reads format "
-            f"{FORMAT_VERSION}; read it with eqrt {identity.eqrt}"
+            f"{path}: is of format {one_line(identity.format)}, this version of eqrt reads format "
+            f"{FORMAT_VERSION}; read it with eqrt {one_line(identity.eqrt)}"
         )
     return identity

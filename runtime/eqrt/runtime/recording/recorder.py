@@ -23,10 +23,11 @@ from eqrt.core.errors import RecordingError
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.exact_forecasts import encode_forecasts
-from eqrt.runtime.recording.order import Order
+from eqrt.runtime.recording.order import Description, Order
 from eqrt.runtime.recording.pipe import MAX_WAITING_BYTES, PipeEnd
+from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, PollEntry, TapedClock, can_entry
-from eqrt.runtime.recording.topics import ENTRY, LENGTH, Topic
+from eqrt.runtime.recording.topics import DESCRIPTION, ENTRY, LENGTH, Topic
 
 _BATCH_S = 0.1  # what a killed service takes with it
 _BATCH_BYTES = 1 << 16
@@ -39,10 +40,21 @@ class Recorder:
     """The service's side of a recording: a witness of its steps, a publisher, an observer."""
 
     def __init__(
-        self, order: Order, clock: TapedClock, max_waiting_bytes: int = MAX_WAITING_BYTES
+        self,
+        order: Order,
+        clock: TapedClock,
+        runs: RunTape,
+        max_waiting_bytes: int = MAX_WAITING_BYTES,
     ) -> None:
-        """`clock`: the pipeline's. Raises RecordingError if the writer cannot be started."""
+        """`clock`: the pipeline's; `runs`: that of what runs its model.
+
+        Raises RecordingError if the writer cannot be started.
+        """
         self._clock = clock
+        self._runs = runs
+        self.description = order.description
+        """What the coming steps are of."""
+        self._described = b""
         self._batch: list[bytes] = []
         self._batch_bytes = 0
         self._in_batch = dict.fromkeys(Topic, 0)
@@ -72,8 +84,16 @@ class Recorder:
     def end(self) -> None:
         """It has been told, and what it made of it is published."""
         self._put_clock()
+        if outcomes := self._runs.take():
+            self._put(Topic.RUNS, _MSGPACK.encode(outcomes))
         if self._batch_bytes >= _BATCH_BYTES or time.monotonic() >= self._due_s:
             self.flush()
+
+    def describe(self, description: Description) -> None:
+        """From the next step on, it is this that predicts: model or tile were exchanged."""
+        self.flush()
+        self.description = description
+        self._described = bytes([DESCRIPTION]) + _MSGPACK.encode(description)
 
     # --- a publisher and observer
 
@@ -105,7 +125,7 @@ class Recorder:
         batch, size = self._batch, self._batch_bytes
         self._batch, self._batch_bytes = [], 0
         lost = self._lost_entry()
-        if self._pipe.is_open and self._offer(b"".join([lost, *batch])):
+        if self._is_described() and self._offer(b"".join([lost, *batch])):
             self._sent_bytes += size
             self._lost = dict.fromkeys(Topic, 0)
         else:
@@ -142,6 +162,12 @@ class Recorder:
                 file=sys.stderr,
                 flush=True,
             )
+
+    def _is_described(self) -> bool:
+        """Whether the writer knows what the coming entries are of: nothing is sent before."""
+        if self._described and self._pipe.is_open and self._offer(self._described):
+            self._described = b""
+        return self._pipe.is_open and not self._described
 
     def _put_clock(self) -> None:
         if said_s := self._clock.take():

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from eqrt.core.errors import ContractError, LogError
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.decoding.profile import Profile, load_profile
 from eqrt.runtime.output.forecasts import ForecastSet
-from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.pipeline import Pipeline, lanes_for
+from eqrt.runtime.prediction.modes import HOLD_S
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.prediction.tiles import Tile, load_tile
-from eqrt.runtime.recording.reader import Recording
-from eqrt.runtime.recording.steps import ReplayedClock
-from eqrt.runtime.recording.topics import PROFILE_FILES, TILE_FILE
+from eqrt.runtime.recording.identity import Identity, one_line
+from eqrt.runtime.recording.reader import Exchanged, Recording
+from eqrt.runtime.recording.runs import ReplayedRunner
+from eqrt.runtime.recording.steps import ReplayedClock, Step
+from eqrt.runtime.recording.topics import PROFILE_FILES, TILE_FILE, Topic
+
+_TOLD = frozenset({Topic.CAN, Topic.POLL, Topic.CLOCK, Topic.RUNS, Topic.FORECASTS})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +32,9 @@ class Instead:
 
     profile: str | None = None
     model: Path | None = None
+    """One that the recording was made with: where it is now. Another: predicts all of it."""
+    other_model: Path | None = None
+    """Predicts all of it, whatever it was made with."""
     tile: Path | None = None
     can: tuple[str, ...] = ()
     """Options `--can`; empty = as recorded."""
@@ -33,37 +42,153 @@ class Instead:
     """True: although it was not said so then."""
 
 
-def replay_recording(
-    recording: Recording, pipeline: Pipeline, clock: ReplayedClock
-) -> Iterator[ForecastSet]:
-    """Every prediction that the service made, bit for bit, if the pipeline is as it was then.
+@dataclass(slots=True)
+class LeftOut:
+    """Cycles that cannot be made again."""
 
-    `clock` is the pipeline's. Raises LogError if the recording cannot be read.
+    reason: str
+    times_s: dict[float, None] = field(default_factory=dict)
+    """Of their newest measurements, to the microsecond, in their order."""
+
+    def add(self, time_s: float) -> None:
+        """One more."""
+        self.times_s[round(time_s, 6)] = None
+
+    def __str__(self) -> str:
+        times_s = list(self.times_s)
+        cycles = f"{len(times_s)} cycles, from {times_s[0]:.6f} to {times_s[-1]:.6f} s,"
+        return f"{cycles} cannot be made again and are left out: {self.reason}"
+
+
+class Replay:
+    """One recording, from its start: every prediction that the service made, bit for bit.
+
+    Where model and tile were exchanged, so they are here. Cycles of a model that is not here any
+    more are left out, and the modes of the half second after them with them.
     """
-    for step in recording.steps():
-        clock.begin(step)
-        yield from pipeline.poll(step.now_s)
-        if step.message is not None:
-            yield from pipeline.feed(step.message, step.now_s)
 
+    def __init__(self, recording: Recording, instead: Instead) -> None:
+        """Raises LogError if the recording does not bring what it needs, and what loading profile,
+        model and tile raises.
+        """
+        self.recording = recording
+        self.left_out: list[LeftOut] = []
+        self._instead = instead
+        self._models = _Models(recording, instead)
+        self._clock = ReplayedClock()
+        self._is_exact = True
+        """Whether the present step is as it was."""
+        self._exact_from_s = -math.inf
+        """On the pipeline's clock; inf = not as long as the same model and tile predict."""
+        with unpacked(recording, recording.attached) as folder:
+            self.pipeline = self._pipeline(folder)
 
-def recorded_pipeline(recording: Recording, instead: Instead, clock: ReplayedClock) -> Pipeline:
-    """The pipeline as it was when the recording began.
-
-    Raises LogError if the recording does not bring what it needs, and what loading profile, model
-    and tile raises.
-    """
-    identity = recording.identity
-    with _unpacked(recording) as folder:
+    def _pipeline(self, folder: Path) -> Pipeline:
+        """As it was when the recording began; `folder` has the files that travel in it."""
+        recording, instead, identity = self.recording, self._instead, self.recording.identity
         profile = _profile(recording, instead, folder)
+        predictor, tile = self._predicting(identity, folder)
         return Pipeline(
             profile,
-            _predictor(recording, instead),
-            _tile(recording, instead, folder),
+            predictor,
+            tile,
             channels=parse_channels(instead.can, profile.roles) or identity.channel_of,
             stationary=identity.is_stationary or instead.stationary,
-            clock=clock,
+            clock=self._clock,
+            run_by=lambda model: ReplayedRunner(model, self._clock),
         )
+
+    def _predicting(self, identity: Identity, folder: Path) -> tuple[Predictor, Tile | None]:
+        """The model and tile that predict from here on; if one is not here, another, for nothing
+        but to go on.
+        """
+        predictor, reason = self._models.find(identity)
+        tile = None if self._instead.tile is None else load_tile(self._instead.tile)
+        if tile is None and identity.tile:
+            tile = _recorded_tile(folder)
+            if tile is None or tile.info.tile_id != identity.tile_id:
+                reason = (
+                    reason or f"their tile, {one_line(identity.tile_id)}, is not in the recording"
+                )
+        if reason:
+            self.left_out.append(LeftOut(reason))
+            self._exact_from_s = math.inf
+        return predictor, tile
+
+    def __iter__(self) -> Iterator[ForecastSet]:
+        """Raises LogError if the recording cannot be read."""
+        for one in self.recording.entries(_TOLD):
+            if isinstance(one.entry, Exchanged):
+                self._exchange(one.entry)
+            elif isinstance(one.entry, Step):
+                made = self._told(one.entry)
+                if self._is_exact:
+                    yield from made
+            elif isinstance(one.entry, ForecastSet) and not self._is_exact:
+                self.left_out[-1].add(one.entry.timestamp_s)
+
+    def _told(self, step: Step) -> list[ForecastSet]:
+        if math.isnan(self._exact_from_s):
+            self._exact_from_s = step.now_s + HOLD_S
+        self._is_exact = step.now_s >= self._exact_from_s
+        self._clock.begin(step)
+        made = self.pipeline.poll(step.now_s)
+        if step.message is None:
+            return made
+        return [*made, *self.pipeline.feed(step.message, step.now_s)]
+
+    def _exchange(self, exchanged: Exchanged) -> None:
+        if self._exact_from_s == math.inf:
+            self._exact_from_s = math.nan  # until the next step tells the time
+        with unpacked(self.recording, exchanged.attached) as folder:
+            predictor, tile = self._predicting(exchanged.identity, folder)
+        self.pipeline.exchange(predictor, tile, lanes_for(tile, predictor))
+
+
+class _Models:
+    """The models of a recording, as far as they are here; what one is called proves nothing."""
+
+    def __init__(self, recording: Recording, instead: Instead) -> None:
+        """Raises LogError if there is none at all, ContractError for one that was asked for."""
+        self._by_id: dict[str, Predictor] = {}
+        other = instead.other_model
+        self._everywhere = None if other is None else Predictor.load(other)
+        wanted = {identity.model_id: identity for identity in recording.identities}
+        if instead.model is not None and self._everywhere is None:
+            given = Predictor.load(instead.model)
+            if given.model_id in wanted:
+                self._by_id[given.model_id] = given
+            else:
+                self._everywhere = given
+        if self._everywhere is None:
+            for identity in wanted.values():
+                self._look_for(identity)
+            if not self._by_id:
+                raise LogError(f"{recording.paths[0]}: was {_unknown(recording.identity)}")
+
+    def _look_for(self, identity: Identity) -> None:
+        """Where it was, and among eqrt's own."""
+        for folder in (Path(identity.model_folder), DEFAULT_ARTIFACT):
+            if identity.model_id not in self._by_id:
+                with contextlib.suppress(ContractError):
+                    predictor = Predictor.load(folder)
+                    if predictor.model_id == identity.model_id:
+                        self._by_id[identity.model_id] = predictor
+
+    def find(self, identity: Identity) -> tuple[Predictor, str]:
+        """The model, or another one and why."""
+        if self._everywhere is not None:
+            return self._everywhere, ""
+        if identity.model_id in self._by_id:
+            return self._by_id[identity.model_id], ""
+        return next(iter(self._by_id.values())), f"they were {_unknown(identity)}"
+
+
+def _unknown(identity: Identity) -> str:
+    return (
+        f"recorded with the model {one_line(identity.model)} ({one_line(identity.model_id)}), "
+        f"which is no more at {one_line(identity.model_folder)}; give it with --model"
+    )
 
 
 def _profile(recording: Recording, instead: Instead, folder: Path) -> Profile:
@@ -72,34 +197,17 @@ def _profile(recording: Recording, instead: Instead, folder: Path) -> Profile:
     return load_profile(str(folder / PROFILE_FILES / f"{recording.identity.profile}.toml"))
 
 
-def _tile(recording: Recording, instead: Instead, folder: Path) -> Tile | None:
-    if instead.tile is not None:
-        return load_tile(instead.tile)
-    return load_tile(folder / TILE_FILE) if recording.identity.tile else None
-
-
-def _predictor(recording: Recording, instead: Instead) -> Predictor:
-    """The recorded model, where it was or among eqrt's own; what it is called proves nothing."""
-    if instead.model is not None:
-        return Predictor.load(instead.model)
-    identity = recording.identity
-    for folder in (Path(identity.model_folder), DEFAULT_ARTIFACT):
-        with contextlib.suppress(ContractError):
-            predictor = Predictor.load(folder)
-            if predictor.model_id == identity.model_id:
-                return predictor
-    raise LogError(
-        f"{recording.paths[0]}: was recorded with the model {identity.model} "
-        f"({identity.model_id}), which is no more at {identity.model_folder}; give it with --model"
-    )
+def _recorded_tile(folder: Path) -> Tile | None:
+    path = folder / TILE_FILE
+    return load_tile(path) if path.exists() else None
 
 
 @contextlib.contextmanager
-def _unpacked(recording: Recording) -> Iterator[Path]:
-    """A folder with the files that travel in the recording."""
+def unpacked(recording: Recording, files: Mapping[str, bytes]) -> Iterator[Path]:
+    """A folder with files that travel in the recording."""
     with tempfile.TemporaryDirectory(prefix="eqrt-") as name:
         folder = Path(name)
-        for attached, content in recording.attached.items():
+        for attached, content in files.items():
             path = folder / _inside(attached, recording)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
@@ -109,7 +217,7 @@ def _unpacked(recording: Recording) -> Iterator[Path]:
 def _inside(name: str, recording: Recording) -> PurePosixPath:
     """The name, if it cannot lead out of the folder."""
     path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or not path.parts:
+    if path.is_absolute() or ".." in path.parts or not path.parts or not name.isprintable():
         raise LogError(
             f"{recording.paths[0]}: a file in it is named {name!r}, which leads elsewhere; give "
             "the profile with --profile"

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import can
 import msgspec
+
+MAX_TIME_S = 1e12
+"""Beyond it, as NaN is, it is no time; 30,000 years."""
+
+
+Time = Annotated[float, msgspec.Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]
+"""Seconds of any clock."""
 
 
 class CanEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """A message on its topic: one msgpack map, keys at their default left out."""
 
-    now_s: float
+    now_s: Time
     """The pipeline's clock when the message was given to it."""
     stamp_s: float
-    """The driver's stamp, most often wall-clock time."""
-    id: int
-    data: bytes = b""
+    """The driver's stamp, most often wall-clock time; whatever it says."""
+    id: Annotated[int, msgspec.Meta(ge=0, le=0x1FFF_FFFF)]
+    data: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
     channel: str | int | None = None
     extended: bool = False
     remote: bool = False
@@ -27,23 +35,23 @@ class CanEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """By this machine, not received."""
     bitrate_switch: bool = False
     error_state: bool = False
-    length: int = -1
+    length: Annotated[int, msgspec.Meta(ge=-1, le=64)] = -1
     """What a remote frame asks for; else that of `data`."""
 
 
 class PollEntry(msgspec.Struct, frozen=True):
     """A moment without a message."""
 
-    now_s: float
+    now_s: Time
 
 
 class Lost(msgspec.Struct, frozen=True, kw_only=True):
     """What is missing at this place of the recording."""
 
-    steps: int
+    steps: Annotated[int, msgspec.Meta(ge=0)]
     """Messages and moments."""
-    forecasts: int
-    statuses: int
+    forecasts: Annotated[int, msgspec.Meta(ge=0)]
+    statuses: Annotated[int, msgspec.Meta(ge=0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +62,8 @@ class Step:
     message: can.Message | None
     clock_s: tuple[float, ...] = ()
     """What its clock said meanwhile, in the order in which it was asked."""
+    outcomes: tuple[int, ...] = ()
+    """What became of the model's runs (`runs.Outcome`); empty = all were answered."""
 
 
 def can_entry(message: can.Message, now_s: float) -> CanEntry:
@@ -117,7 +127,7 @@ class TapedClock:
 
 
 class ReplayedClock:
-    """Says what a recorded clock said in the same step.
+    """Says what a recorded clock said in the same step, and what became of the model's runs.
 
     Asked more often than then (another model may ask more often), it stays at its last answer:
     from there on, no time passes.
@@ -126,11 +136,17 @@ class ReplayedClock:
     def __init__(self) -> None:
         self._now_s = 0.0
         self._coming_s: list[float] = []
+        self._outcomes: list[int] = []
 
     def begin(self, step: Step) -> None:
         """The pipeline is about to be told this."""
         self._now_s = step.now_s
         self._coming_s = list(reversed(step.clock_s))
+        self._outcomes = list(reversed(step.outcomes))
+
+    def outcome(self) -> int:
+        """What became of the model's next run in this step (`runs.Outcome`)."""
+        return self._outcomes.pop() if self._outcomes else 0
 
     def __call__(self) -> float:
         """The time, in seconds."""

@@ -35,6 +35,9 @@ class Topic(IntEnum):
     """`ServiceStatus`, once a second."""
     LOST = 5
     """How much is missing here, because it could not be written in time (`Lost`)."""
+    RUNS = 6
+    """What became of the model's runs during the step before, unless all were answered: a list of
+    int (`runs.Outcome`)."""
 
 
 NAMES = {
@@ -44,10 +47,15 @@ NAMES = {
     Topic.FORECASTS: "/eqrt/forecasts",
     Topic.STATUS: "/eqrt/status",
     Topic.LOST: "/eqrt/lost",
+    Topic.RUNS: "/eqrt/runs",
 }
 """As the recording calls them."""
 JSON_TOPICS = frozenset({Topic.STATUS, Topic.LOST})
 """Written as JSON with a schema, which viewers show as it is; the others are msgpack."""
+
+DESCRIPTION = 0xFF
+"""First byte of a piece that is no batch: a msgpack map (`order.Description`) of what the run goes
+on with. A new file begins there."""
 
 LENGTH = struct.Struct("<I")
 """What goes to the writer is pieces, each led by its length: first one msgpack map (`Order`), then

@@ -23,8 +23,9 @@ import msgspec
 from mcap.writer import Writer
 
 from eqrt.runtime.recording.folder import delete_oldest, file_name, free_bytes, total_bytes
-from eqrt.runtime.recording.order import Order
+from eqrt.runtime.recording.order import Attached, Description, Order
 from eqrt.runtime.recording.topics import (
+    DESCRIPTION,
     ENTRY,
     FORMAT_VERSION,
     IDENTITY,
@@ -130,6 +131,7 @@ class _Recording:
 
     def __init__(self, order: Order) -> None:
         self._order = order
+        self._description = _read(order.description)
         self._folder = Path(order.folder)
         self._part = 0
         self._file: _File | None = None
@@ -141,9 +143,13 @@ class _Recording:
 
     def add(self, batch: bytes) -> None:
         """Raises LimitReachedError, OSError."""
+        if batch[0] == DESCRIPTION:
+            self.close()
+            self._description = _read(msgspec.msgpack.decode(batch[1:], type=Description))
+            return
         if self._file is None:
             self._make_room()
-            self._file = _File(self._folder, self._order, self._part)
+            self._file = _File(self._folder, self._order, self._description, self._part)
             self._part += 1
         self._file.add(batch)
 
@@ -183,20 +189,30 @@ class _Recording:
         )
 
 
+def _read(description: Description) -> Description:
+    """With the content of files that are only named; one that cannot be read is left out."""
+    attached = []
+    for file in description.attached:
+        with contextlib.suppress(OSError):
+            content = Path(file.path).read_bytes() if file.path else file.content
+            attached.append(Attached(file.name, file.media_type, content))
+    return Description(identity=description.identity, attached=attached)
+
+
 class _File:
     """One MCAP file."""
 
-    def __init__(self, folder: Path, order: Order, part: int) -> None:
+    def __init__(self, folder: Path, order: Order, description: Description, part: int) -> None:
         self._begun_s = time.monotonic()
         path = folder / file_name(order.run, part, time.time())
         self._stream: BinaryIO = path.open("xb")
         fcntl.flock(self._stream, fcntl.LOCK_EX)  # so that nobody deletes it
         self._writer = Writer(self._stream, chunk_size=_NEVER)
-        self._writer.start(PROFILE, f"eqrt {order.identity['eqrt']}")
+        self._writer.start(PROFILE, f"eqrt {description.identity['eqrt']}")
         self._channels = {topic: self._channel(topic, order) for topic in Topic}
         self._counts = dict.fromkeys(Topic, 0)
         self.chunk_bytes = 0
-        self._say_what_it_is(order, part)
+        self._say_what_it_is(order.run, description, part)
 
     def _channel(self, topic: Topic, order: Order) -> int:
         name = NAMES[topic]
@@ -207,11 +223,11 @@ class _File:
         )
         return self._writer.register_channel(name, "json", schema)
 
-    def _say_what_it_is(self, order: Order, part: int) -> None:
-        about = {"format": str(FORMAT_VERSION), "run": order.run, "part": str(part)}
-        self._writer.add_metadata(IDENTITY, about | order.identity)
+    def _say_what_it_is(self, run: str, description: Description, part: int) -> None:
+        about = {"format": str(FORMAT_VERSION), "run": run, "part": str(part)}
+        self._writer.add_metadata(IDENTITY, about | description.identity)
         now_ns = time.time_ns()
-        for file in order.attached:
+        for file in description.attached:
             self._writer.add_attachment(0, now_ns, file.name, file.media_type, file.content)
         self._stream.flush()
 
