@@ -15,7 +15,7 @@ MUTATION_MODULES ?=
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures systems-table view-figures faults soak load under-load clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures systems-table view-figures faults soak load under-load recording-cost clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -64,6 +64,9 @@ figures: $(RUNTIME_VENV)/.installed ## print what eqrt does on this machine, mea
 
 under-load: $(RUNTIME_VENV)/.installed ## measure the service beside three busy programs, with and without [realtime]; needs its rights
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/under_load.py
+
+recording-cost: $(RUNTIME_VENV)/.installed ## measure the service's latency with and without --record, in turns, in 7 minutes; wants it quiet
+	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python tests/bench/recording_cost.py
 
 load: $(RUNTIME_VENV)/.installed ## send 4,000 and 10,000 messages/s to a service, in 2 minutes; nothing may be lost
 	@PYTHONPATH=tests $(RUNTIME_VENV)/bin/python -m load.run --seconds 60

@@ -12,19 +12,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import multiprocessing
-import time
 from collections.abc import Iterator
 
 import numpy as np
 
-from drives import Car, cycle
-from eqrt.core.frames import Pose2
-from eqrt.runtime.bus.buses import LOCAL, open_bus
-from processes import Heard, Serving
+from service_latency import PERIOD_S, serve
 
-OBJECTS = 32
-PERIOD_S = 0.1
-WARM_UP_S = 3
 SETTINGS = {
     "default": [],
     "realtime": [
@@ -34,7 +27,6 @@ SETTINGS = {
         "--realtime-strict",
     ],
 }
-CARS = [Car(object_id=i, x_m=8.0 * i, y_m=4.0 * (i % 3), speed_mps=0.5) for i in range(OBJECTS)]
 
 
 def main() -> None:
@@ -53,26 +45,8 @@ def main() -> None:
 
 def row(options: list[str], seconds: float) -> str:
     """The figures of one service."""
-    channel = f"load-{time.monotonic_ns()}"
-    with (
-        Heard(channel, []) as heard,
-        Serving(
-            "--can", channel, "--can-interface", LOCAL, "--profile", "generic", "--quiet",
-            "--datagrams", heard.address, *options,
-        ),
-        open_bus(channel, LOCAL, receive_ids=[]) as bus,
-    ):  # fmt: skip
-        begun_s = time.monotonic()
-        step = 0
-        while time.monotonic() < begun_s + WARM_UP_S + seconds:
-            for message in cycle(CARS, step * PERIOD_S, pose=Pose2()):
-                bus.send(message)
-            step += 1
-            time.sleep(max(0.0, begun_s + step * PERIOD_S - time.monotonic()))
-        statuses = heard.statuses[WARM_UP_S:]
-    latencies_ms = 1e3 * np.array([one for status in statuses for one in status.latencies_s])
+    latencies_ms, shed = serve(options, seconds)
     quantiles = np.quantile(latencies_ms, [0.5, 0.99, 0.999, 1.0])
-    shed = statuses[-1].totals["pipeline_shed"] - statuses[0].totals["pipeline_shed"]
     late = int(np.count_nonzero(latencies_ms > 1e3 * PERIOD_S))
     told = " | ".join(f"{value:.1f}" for value in quantiles)
     return f"{len(latencies_ms)} | {told} | {late} | {shed}"

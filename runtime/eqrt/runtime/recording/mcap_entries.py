@@ -10,8 +10,8 @@ from eqrt.core.errors import LogError
 from eqrt.runtime.recording.topics import NAMES, PROFILE, Topic
 
 _TOPICS = {name: topic for topic, name in NAMES.items()}
-_MAX_RECORD_BYTES = 1 << 28  # far above any tile: a damaged length is no reason to wait
-_MAX_ATTACHED_BYTES = 1 << 28  # of all files that travel in a recording
+_MAX_RECORD_BYTES = 1 << 29  # twice the largest tile: a damaged length is no reason to wait
+_MAX_ATTACHED_BYTES = 1 << 29  # of all files that travel in a recording
 _MAX_CHUNK_BYTES = 1 << 24  # unpacked; ours are closed at 1 MiB, and may have a second's rest
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ZSTD_HEAD_BYTES = 6
