@@ -139,8 +139,8 @@ def read_identity(values: Mapping[str, str], path: Path) -> Identity:
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         version = one_line(values.get("eqrt", "which it does not say"))
         raise LogError(
-            f"{path}: its description is not of this version of eqrt ({in_one_line(error)}); read it "
-            f"with the version that wrote it, {version}"
+            f"{path}: its description is not of this version of eqrt ({in_one_line(error)}); "
+            f"read it with the version that wrote it, {version}"
         ) from error
     return identity
 
