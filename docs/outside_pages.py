@@ -14,7 +14,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
-OUTSIDE = {"README.md": "about.md"} | {
+OUTSIDE = {"README.md": "about.md", "SECURITY.md": "security.md"} | {
     path.relative_to(ROOT).as_posix(): path.relative_to(ROOT).as_posix()
     for pattern in ("deploy/*.md", "deploy/examples/*.md", "deploy/models/*.md")
     for path in ROOT.glob(pattern)

@@ -149,5 +149,7 @@ def playing(log: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """`eqrt play` on the local bus, in a process."""
     command = [*EQRT, "play", str(log), "--can-interface", LOCAL, *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment()) as process:
-        yield process
-        process.terminate()
+        try:
+            yield process
+        finally:
+            process.terminate()

@@ -27,6 +27,11 @@ class Command:
         """As the shell splits them."""
         return shlex.split(self.text, comments=True)
 
+    @property
+    def program(self) -> str:
+        """The first word that is not a setting of its environment."""
+        return next(word for word in self.words if not re.match(r"[A-Z]+=", word))
+
     def __str__(self) -> str:
         return f"{self.page}:{self.line}: {self.text}"
 

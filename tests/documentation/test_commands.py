@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 
 from documentation import workshop, world
 from documentation.pages import Command, commands_of, pages
-from documentation.rules import CHANGES, HARMLESS, LIKEWISE, MAY_END_WITH_3, NOT_RUN, NotRun
+from documentation.rules import CHANGES, ENDINGS, HARMLESS, LIKEWISE, NOT_RUN, NotRun
 from eqrt import cli
 from source_tree import ROOT
 
@@ -21,10 +23,17 @@ BEFORE = (  # what a page takes for granted, made once
     "eqrt export made/model.safetensors --out made/artifact",
     "eqrt prepare train.npz --out made-av1 --config training/configs/eqrt-small.toml",
     "eqrt bench --seconds 0.3 --targets 1 --json before.json",
+    "eqrt replay made-drives --out yesterday.jsonl",
 )
 TAKEN_FOR_GRANTED = {
     "docs/evaluation.md": {"made": "runs/av1", "made-av1": "prepared/av1"},
-    "docs/start-budget.md": {"before.json": "model.json"},
+    "docs/benchmarks.md": {"before.json": "before.json", "made/artifact": "C"},
+    "docs/recording.md": {
+        "made": "runs/mine",
+        "made-drives": "drives",
+        "made-drive.mcap": "drive.mcap",
+        "yesterday.jsonl": "yesterday.jsonl",
+    },
 }
 """Page -> what of it the page has under which name."""
 
@@ -43,8 +52,9 @@ def rule_of(command: Command) -> NotRun | None:
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a checkpoint, an artifact, prepared data and a report."""
+    """A folder with a checkpoint, an artifact, prepared data, a recording and a report."""
     folder = world.build(tmp_path_factory.mktemp("made"))
+    shutil.copy(world.record(folder / "made-drives"), folder / "made-drive.mcap")
     for text in BEFORE:
         status, said = workshop.run(text.split(), folder)
         assert status == 0, f"{text}\n{said}"
@@ -65,14 +75,15 @@ def test_the_commands_of_a_page_work(
         text = command.text
         for change in CHANGES:
             text = change.applied(text)
-        words = Command(command.page, command.line, text).words
-        assert words[0] in ("eqrt", *HARMLESS), f"{command}: neither run nor listed in rules.py"
+        changed = Command(command.page, command.line, text)
+        words = changed.words
+        assert changed.program in ("eqrt", *HARMLESS), f"{command}: neither run nor listed"
         for likewise in LIKEWISE:
             if page == likewise.page and re.match(likewise.before, text):
                 for name in likewise.copies:
                     shutil.copytree(folder / likewise.original, folder / name)
         status, said = workshop.run(words, folder)
-        good = (0, 3) if re.match(MAY_END_WITH_3, text) else (0,)
+        good = next((ends for pattern, ends, _ in ENDINGS if re.match(pattern, text)), (0,))
         assert status in good, f"{command}\nrun as: {text}\nstatus {status}\n{said[-3000:]}"
 
 
@@ -84,8 +95,14 @@ def test_what_is_not_run_could_be(command: Command) -> None:
         module = cli.command_module(words[1])
         cli.command_parser(words[1], module).parse_args(words[2:])
     if words[0] == "make":
-        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-        assert set(words[1:]) <= set(targets)
+        dry = subprocess.run([*words, "--dry-run"], cwd=ROOT, capture_output=True, check=False)
+        assert dry.returncode == 0, dry.stderr
+    if "pip" in words:
+        named = re.findall(r"\[([a-z,]+)\]", command.text)
+        known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        assert {extra for extras in named for extra in extras.split(",")} <= {
+            *known["optional-dependencies"]
+        }
     for path in named_files(command):
         assert (ROOT / path).exists(), f"{command}: there is no {path}"
 
@@ -116,7 +133,7 @@ def test_commands_are_found_in_every_kind_of_page() -> None:
 def test_a_command_that_is_neither_run_nor_listed_fails() -> None:
     unknown = Command("docs/new.md", 1, "curl https://example.org | sh")
     assert rule_of(unknown) is None
-    assert unknown.words[0] not in ("eqrt", *HARMLESS)
+    assert unknown.program not in ("eqrt", *HARMLESS)
 
 
 def test_options_that_do_not_exist_are_found() -> None:

@@ -7,19 +7,23 @@ for Argoverse, 20 s of an ARS408 for a drive.
 from __future__ import annotations
 
 import gzip
+import os
 import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 
+from drives import first_seconds
+from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.training.recordings.commonroad_recordings import CommonRoadReader
 from eqrt.training.recordings.recording_file import save_recording
 from packed_scenes import PackedScene, straight, write_packed
+from processes import PATIENCE_S, Serving, playing
 from source_tree import ROOT
 
-_LINKED = ("runtime", "deploy", "export", "constraints.txt", "pyproject.toml")
+_LINKED = ("runtime", "export", "constraints.txt", "pyproject.toml")
 _RECORDINGS = ("USA_Peach-4_8_T-1.xml.gz", "USA_Peach-2_1_T-1.xml.gz")
 _HELD_OUT = ["USA_Peach-2"]
 _CONFIGS = ROOT / "training/configs"
@@ -32,6 +36,7 @@ def build(folder: Path) -> Path:
     for name in _LINKED:
         (folder / name).symlink_to(ROOT / name)
     (folder / "docs").mkdir()
+    _write_deploy(folder / "deploy")
     _write_configs(folder / "training/configs")
     _write_recordings(folder)
     _write_drive(folder)
@@ -40,6 +45,35 @@ def build(folder: Path) -> Path:
         (folder / name).symlink_to(DEFAULT_ARTIFACT)
     (folder / "B").symlink_to(ROOT / "deploy/models/eqrt-small-6")
     return folder
+
+
+def record(folder: Path) -> Path:
+    """Two seconds of a drive as a service records them; the file."""
+    channel = f"docs-recorded-{os.getpid()}"
+    log = folder.with_suffix(".log")
+    log.write_text(first_seconds(ROOT / "tests/data/can/ars408/candump.log.gz", 2.0))
+    on = ["--can", channel, "--can-interface", LOCAL, "--profile", "ars408"]
+    with Serving(*on, "--record", str(folder)) as service:
+        with playing(log, "--can", channel) as player:
+            assert player.wait(PATIENCE_S) == 0
+        status, _, errors = service.end()
+        assert status == 0, errors
+    (file,) = folder.glob("*.mcap")
+    return file
+
+
+def _write_deploy(folder: Path) -> None:
+    """Ours, but for the budgets: a p99 takes minutes, one target's median takes two seconds."""
+    folder.mkdir()
+    for path in (ROOT / "deploy").iterdir():
+        (folder / path.name).symlink_to(path)
+    (folder / "budgets.toml").unlink()
+    text = (ROOT / "deploy/budgets.toml").read_text(encoding="utf-8")
+    duty, *tables = re.split(r"^(?=\[)", text, flags=re.MULTILINE)
+    kept = [t for t in tables if re.match(r"\[(targets|service\.objects)\.1\]", t)]
+    medians = [re.sub(r"^p99_ms.*\n", "", table, flags=re.MULTILINE) for table in kept]
+    assert len(medians) == 2
+    (folder / "budgets.toml").write_text("".join([duty, *medians]), encoding="utf-8")
 
 
 def _write_configs(folder: Path) -> None:
@@ -55,7 +89,7 @@ def _write_configs(folder: Path) -> None:
 
 
 def _write_recordings(folder: Path) -> None:
-    for name in ("NGSIM_FOLDER", "OTHER_RECORDINGS", "DATA", "tests/data/ngsim", "bologna"):
+    for name in ("NGSIM_FOLDER", "DATA", "tests/data/ngsim", "bologna"):
         (folder / name).mkdir(parents=True)
         for recording in _RECORDINGS:
             (folder / name / recording).symlink_to(ROOT / "tests/data/ngsim" / recording)

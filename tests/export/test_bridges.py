@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import mcap.reader
+import msgpack
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -18,14 +21,16 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from rosbags.highlevel import AnyReader
 
+from bridging import bridge
 from drives import DRIVES, first_seconds, shipped_predictor
 from eqrt.cli import main
 from eqrt.export.bridges.moments import Moment
 from eqrt.export.bridges.ros2 import PREDICTED_OBJECTS, TOPIC, autoware_types, moved_on
+from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.bus.candump import candump_line, candump_message
 from eqrt.runtime.bus.health import BusHealth
 from eqrt.runtime.decoding.profile import load_profile
-from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
@@ -39,6 +44,8 @@ from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, TapedClock
 from eqrt.runtime.status_book import StatusBook
 from forecast_sets import one_car
+from plotjuggler import curves, plotjuggler_server, series
+from processes import PATIENCE_S, Serving, playing
 from source_tree import ROOT
 
 NGSIM = DRIVES["ngsim"]
@@ -172,7 +179,7 @@ def test_foxglove_has_lanes_numbers_and_a_log(
     assert abs(shown["/cycle"][0][0] / 1e9 - time.time()) < 600.0  # the wall clock
 
 
-def test_the_layouts_show_topics_that_are_there(
+def test_foxgloves_layout_shows_topics_that_are_there(
     shown: dict[str, list[tuple[int, bytes]]],
 ) -> None:
     layout = json.loads((ROOT / "deploy/viewers/foxglove-layout.json").read_text())
@@ -187,6 +194,57 @@ def test_the_layouts_show_topics_that_are_there(
         topic, _, field = value.partition(".")
         assert topic == "/cycle"
         assert field in keys
+
+
+# --- PlotJuggler: what it calls the series of a message is in plotjuggler.py
+
+
+def test_plotjugglers_layout_of_a_file_shows_fields_that_are_there(
+    shown: dict[str, list[tuple[int, bytes]]],
+) -> None:
+    named = curves(ROOT / "deploy/viewers/plotjuggler-recording.xml")
+    there = {
+        name
+        for topic in ("/cycle", "/status")
+        for name, _ in series(json.loads(shown[topic][-1][1]), topic)
+    }
+    assert named
+    assert named <= there
+
+
+def test_plotjugglers_live_layout_shows_series_that_are_sent() -> None:
+    """By a bridge beside a service that hears a drive, in processes of their own."""
+    named = curves(ROOT / "deploy/viewers/plotjuggler-live.xml")
+    channel = f"plotted-{os.getpid()}"
+    there: set[str] = set()
+    with (
+        plotjuggler_server() as (server, address),
+        bridge("--to", "plotjuggler", "--send", address) as (_, datagrams),
+        Serving(*NGSIM.options, *on(channel), "--datagrams", datagrams),
+        playing(NGSIM.log, "--can", f"can0={channel}"),
+    ):
+        end_s = time.monotonic() + PATIENCE_S
+        while not named <= there:
+            assert time.monotonic() < end_s, named - there
+            there |= {name for name, _ in series(msgpack.unpackb(server.recv(65_535)))}
+    assert named
+
+
+def on(channel: str) -> list[str]:
+    """Options of `eqrt serve`: on a bus of this machine's own."""
+    return ["--can", channel, "--can-interface", LOCAL]
+
+
+@pytest.mark.parametrize("layout", ["plotjuggler-live", "plotjuggler-recording"])
+def test_plotjugglers_layouts_say_what_the_numbers_of_modes_mean(layout: str) -> None:
+    root = ElementTree.parse(ROOT / f"deploy/viewers/{layout}.xml").getroot()
+    (title,) = (area.get("name", "") for area in root.iter("DockArea") if is_of_modes(area))
+    told = dict(part.split(" ") for part in title.removeprefix("Mode: ").split(", "))
+    assert told == {str(mode.value): mode.name for mode in Mode if mode is not Mode.PARTIAL}
+
+
+def is_of_modes(area: ElementTree.Element) -> bool:
+    return any(curve.get("name", "").endswith("/mode") for curve in area.iter("curve"))
 
 
 # --- ROS 2

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from bridging import bridge
 from eqrt.cli import main
 from eqrt.export.bridges.bridge import DEFAULT_LISTEN
 from eqrt.export.bridges.to_plotjuggler import MAX_BYTES, encode_cycle, encode_status
@@ -33,8 +34,9 @@ from eqrt.runtime.output.datagrams import (
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from forecast_sets import many, nobody, one_car
-from processes import EQRT, PATIENCE_S, environment
-from source_tree import ROOT, SOURCE_ROOTS
+from plotjuggler import plotjuggler_server, series
+from processes import PATIENCE_S, environment
+from source_tree import ROOT
 from viewing import free_udp_port
 
 STATUS = ServiceStatus(
@@ -57,28 +59,6 @@ STATUS = ServiceStatus(
 )
 
 
-@contextlib.contextmanager
-def bridge(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`eqrt bridge` in a process that listens, and where it does."""
-    datagrams = f"127.0.0.1:{free_udp_port()}"
-    path = ":".join(str(ROOT / root) for root in SOURCE_ROOTS)
-    with subprocess.Popen(
-        [*EQRT, "bridge", *arguments, "--datagrams", datagrams],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment(PYTHONPATH=path),
-    ) as process:
-        try:
-            assert process.stdout is not None
-            ready = process.stdout.readline()
-            assert ready.startswith(f"eqrt bridge: from {datagrams} to "), process.communicate()
-            yield process, datagrams
-        finally:
-            if process.poll() is None:
-                process.kill()
-
-
 def ended(process: subprocess.Popen[str], by: signal.Signals) -> tuple[int, str, str]:
     process.send_signal(by)
     stdout, stderr = process.communicate(timeout=PATIENCE_S)
@@ -91,26 +71,14 @@ def ended(process: subprocess.Popen[str], by: signal.Signals) -> tuple[int, str,
 @pytest.fixture
 def plotjuggler() -> Iterator[socket.socket]:
     """Where PlotJuggler would listen."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
-        server.bind(("127.0.0.1", 0))
-        server.settimeout(PATIENCE_S)
+    with plotjuggler_server() as (server, _):
         yield server
 
 
-def numbers(content: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """The series that PlotJuggler makes of a map; fails if a leaf is no number."""
-    for key, value in content.items():
-        if isinstance(value, dict):
-            yield from numbers(value, f"{path}{key}/")
-        else:
-            assert isinstance(value, int | float), (path, key, value)
-            assert np.isfinite(value)
-            yield path + key, value
-
-
-def series(payload: bytes) -> dict[str, float]:
+def plotted_of(payload: bytes) -> dict[str, float]:
+    """The series of a datagram."""
     assert len(payload) <= MAX_BYTES
-    return dict(numbers(msgpack.unpackb(payload)))
+    return dict(series(msgpack.unpackb(payload)))
 
 
 def test_plotjuggler_is_sent_cycles_and_status(plotjuggler: socket.socket) -> None:
@@ -123,43 +91,43 @@ def test_plotjuggler_is_sent_cycles_and_status(plotjuggler: socket.socket) -> No
         service.send(b"nothing of ours")
         service.publish(one_car())
         service.report(STATUS)
-        cycle, status = (series(plotjuggler.recv(65_535)) for _ in range(2))
+        cycle, status = (plotted_of(plotjuggler.recv(65_535)) for _ in range(2))
         status_code, stdout, stderr = ended(process, signal.SIGTERM)
     assert cycle == {
-        "timestamp": 1000.0,
-        "mode": 1,
-        "cycle/number": 300,
-        "cycle/objects": 1,
-        "cycle/fallbacks": 0,
-        "cycle/input_age_ms": pytest.approx(12.0),
-        "cycle/oldest_ms": pytest.approx(50.0),
-        "cycle/compute_ms": pytest.approx(8.1),
-        "ego/x": 100.0,
-        "ego/y": 200.0,
-        "ego/yaw": pytest.approx(np.pi / 2),
-        "ego/speed": 8.0,
-        "track_65537/mode": 3,
-        "track_65537/object": 17,
-        "track_65537/age_ms": pytest.approx(50.0),
-        "track_65537/speed": pytest.approx(10.0),
-        "track_65537/probability": 0.75,
-        "track_65537/x": pytest.approx(20.0),
-        "track_65537/y": pytest.approx(0.0, abs=1e-6),
-        "track_65537/range": pytest.approx(20.0),
-        "track_65537/x_1s": pytest.approx(30.0, abs=1e-4),
-        "track_65537/y_1s": pytest.approx(0.0, abs=1e-4),
-        "track_65537/x_2s": pytest.approx(40.0, abs=1e-4),
-        "track_65537/y_2s": pytest.approx(0.0, abs=1e-4),
-        "track_65537/x_3s": pytest.approx(50.0, abs=1e-4),
-        "track_65537/y_3s": pytest.approx(0.0, abs=1e-4),
+        "/timestamp": 1000.0,
+        "/mode": 1,
+        "/cycle/number": 300,
+        "/cycle/objects": 1,
+        "/cycle/fallbacks": 0,
+        "/cycle/input_age_ms": pytest.approx(12.0),
+        "/cycle/oldest_ms": pytest.approx(50.0),
+        "/cycle/compute_ms": pytest.approx(8.1),
+        "/ego/x": 100.0,
+        "/ego/y": 200.0,
+        "/ego/yaw": pytest.approx(np.pi / 2),
+        "/ego/speed": 8.0,
+        "/track_65537/mode": 3,
+        "/track_65537/object": 17,
+        "/track_65537/age_ms": pytest.approx(50.0),
+        "/track_65537/speed": pytest.approx(10.0),
+        "/track_65537/probability": 0.75,
+        "/track_65537/x": pytest.approx(20.0),
+        "/track_65537/y": pytest.approx(0.0, abs=1e-6),
+        "/track_65537/range": pytest.approx(20.0),
+        "/track_65537/x_1s": pytest.approx(30.0, abs=1e-4),
+        "/track_65537/y_1s": pytest.approx(0.0, abs=1e-4),
+        "/track_65537/x_2s": pytest.approx(40.0, abs=1e-4),
+        "/track_65537/y_2s": pytest.approx(0.0, abs=1e-4),
+        "/track_65537/x_3s": pytest.approx(50.0, abs=1e-4),
+        "/track_65537/y_3s": pytest.approx(0.0, abs=1e-4),
     }
-    assert status["timestamp"] == 1001.0
-    assert status["status/messages_per_s"] == 600.0
-    assert status["status/latency_median_ms"] == pytest.approx(12.0)
-    assert status["status/latency_worst_ms"] == pytest.approx(50.0)
-    assert status["status/stages/infer_ms"] == pytest.approx(5.0)
-    assert status["status/drops/can_failed"] == 4
-    assert status["status/drops/datagrams_failed"] == 0
+    assert status["/timestamp"] == 1001.0
+    assert status["/status/messages_per_s"] == 600.0
+    assert status["/status/latency_median_ms"] == pytest.approx(12.0)
+    assert status["/status/latency_worst_ms"] == pytest.approx(50.0)
+    assert status["/status/stages/infer_ms"] == pytest.approx(5.0)
+    assert status["/status/drops/can_failed"] == 4
+    assert status["/status/drops/datagrams_failed"] == 0
     assert (status_code, stdout) == (0, "eqrt bridge: ended; 1 cycles in 2 datagrams\n")
     assert stderr.startswith("eqrt bridge: not passed on: not a datagram of eqrt")
 
@@ -168,18 +136,18 @@ def test_left_and_right_are_those_of_the_ego_vehicle() -> None:
     """It faces north: 3 m to the west of it are 3 m to its left."""
     car = replace(one_car(), position=np.array([[97.0, 210.0]]))
     (payload,) = encode_cycle(car)
-    plotted = series(payload)
-    assert (plotted["track_65537/x"], plotted["track_65537/y"]) == pytest.approx((10.0, 3.0))
+    plotted = plotted_of(payload)
+    assert (plotted["/track_65537/x"], plotted["/track_65537/y"]) == pytest.approx((10.0, 3.0))
 
 
 def test_a_large_cycle_is_split_by_tracks_each_with_its_time() -> None:
     forecasts = many(12)
-    datagrams = [series(payload) for payload in encode_cycle(forecasts)]
+    datagrams = [plotted_of(payload) for payload in encode_cycle(forecasts)]
     assert len(datagrams) == 3
-    assert [one["timestamp"] for one in datagrams] == [50.0, 50.0, 50.0]
-    assert ["cycle/objects" in one for one in datagrams] == [True, False, False]
+    assert [one["/timestamp"] for one in datagrams] == [50.0, 50.0, 50.0]
+    assert ["/cycle/objects" in one for one in datagrams] == [True, False, False]
     ranges = {name: v for one in datagrams for name, v in one.items() if name.endswith("/range")}
-    assert set(ranges) == {f"track_{number}/range" for number in forecasts.track_id}
+    assert set(ranges) == {f"/track_{number}/range" for number in forecasts.track_id}
     ego = forecasts.map_from_ego
     far = np.linalg.norm(forecasts.position - (ego.x_m, ego.y_m), axis=-1)
     np.testing.assert_allclose(list(ranges.values()), far)
@@ -188,18 +156,18 @@ def test_a_large_cycle_is_split_by_tracks_each_with_its_time() -> None:
 def test_what_is_not_known_is_not_plotted() -> None:
     blind = replace(one_car(), ego_speed_mps=np.nan, velocity=np.full((1, 2), np.nan))
     (payload,) = encode_cycle(blind)
-    plotted = series(payload)
-    assert {name for name in plotted if name.startswith("track_")} == {
-        "track_65537/mode",
-        "track_65537/object",
-        "track_65537/age_ms",
-        "track_65537/probability",
+    plotted = plotted_of(payload)
+    assert {name for name in plotted if name.startswith("/track_")} == {
+        "/track_65537/mode",
+        "/track_65537/object",
+        "/track_65537/age_ms",
+        "/track_65537/probability",
     }
-    assert not any(name.startswith("ego/") for name in plotted)
+    assert not any(name.startswith("/ego/") for name in plotted)
     (payload,) = encode_cycle(nobody())
-    assert series(payload)["cycle/objects"] == 0
+    assert plotted_of(payload)["/cycle/objects"] == 0
     quiet = replace_status(latencies_s=[], seconds=0.0)
-    assert not {"status/latency_worst_ms", "status/messages_per_s"} & set(series(quiet))
+    assert not {"/status/latency_worst_ms", "/status/messages_per_s"} & set(plotted_of(quiet))
 
 
 def replace_status(**changes: Any) -> bytes:

@@ -22,10 +22,11 @@ from eqrt.runtime.replay import replay
 SVG = "{http://www.w3.org/2000/svg}"
 LABELS = (
     "history, 2 s",
-    "constant velocity, 3 s",
     "what happened, 3 s",
+    "constant velocity, 3 s",
     "eqrt's prediction, 3 s",
     "ego",
+    "N",
     "20 m",
 )
 
@@ -66,7 +67,8 @@ def test_a_picture_is_xml_with_a_line_for_everything() -> None:
     assert picture.tag == f"{SVG}svg"
     assert len(list(picture.iter(f"{SVG}polyline"))) == 4 + 2
     circles = [c.attrib["fill"] for c in picture.iter(f"{SVG}circle")]
-    assert circles == ["#333333", "#009e73", "#009e73"]  # the car, the ego, and the ego in the key
+    # The ends of two predictions, the car, the ego, and the ego in the key.
+    assert circles == ["#333333", "#d55e00", "#333333", "#009e73", "#009e73"]
 
 
 def test_titles_and_labels_are_text() -> None:
@@ -77,19 +79,41 @@ def test_what_is_not_drawn_is_not_in_the_key() -> None:
     moment = one_car()
     moment.lines["constant velocity"].clear()
     moment.ego = None
-    assert texts(drawn(moment))[1:] == [LABELS[0], LABELS[2], LABELS[3], LABELS[5]]
+    assert texts(drawn(moment))[1:] == [*LABELS[:2], LABELS[3], *LABELS[5:]]
 
 
-def test_north_is_up_and_a_metre_is_a_metre_in_both_directions() -> None:
-    """The scale bar is as long as 20 m of the road."""
+def test_a_metre_is_a_metre_in_both_directions() -> None:
+    """The scale bar is as long as 20 m of the road, which has a corner."""
     moment = Moment(title="")
     moment.lines["truth"].append(line((0.0, 0.0), (20.0, 0.0), (20.0, 20.0)))
     picture = drawn(moment)
-    (start, corner, end) = pixels(picture)
-    assert corner[0] - start[0] == pytest.approx(corner[1] - end[1], abs=0.2)
+    start, corner, end = pixels(picture)
     bar = next(picture.iter(f"{SVG}path")).attrib["d"]
     left, right = (float(number) for number in re.findall(r"[MH]([\d.]+)", bar))
-    assert right - left == pytest.approx(corner[0] - start[0], abs=0.2)
+    for side in (corner - start, end - corner):
+        assert np.hypot(*side) == pytest.approx(right - left, abs=0.2)
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0), (0.0, 1.0), (-0.6, -0.8)])
+def test_traffic_goes_to_the_right_and_left_is_up(way: tuple[float, float]) -> None:
+    """Whatever the road's course, and the arrow points north."""
+    along = np.array(way)
+    left = np.array([-along[1], along[0]])
+    moment = Moment(title="")
+    moment.lines["truth"].append(np.array([0.0 * along, 100.0 * along]))
+    moment.lines["truth"].append(np.array([5.0 * left, 40.0 * along + 5.0 * left]))
+    picture = drawn(moment)
+    start, end, left_start, _ = pixels(picture)
+    assert end[0] - start[0] == pytest.approx(1152.0, rel=0.02)  # the picture's width
+    assert abs(end[1] - start[1]) < 40.0
+    assert left_start[1] < start[1] - 30.0
+    tip, *corners = (
+        np.array(corner.split(","), np.float64)
+        for corner in next(picture.iter(f"{SVG}polygon")).attrib["points"].split()
+    )
+    arrow = tip - np.mean(corners, axis=0)
+    north = np.array([along[1], -along[0]])  # in pixels, y down
+    assert arrow @ north == pytest.approx(np.hypot(*arrow), rel=0.01)
 
 
 @pytest.mark.parametrize("far_m", [0.0, 30.0, 3000.0])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
+import re
 import signal
 import threading
 import time
@@ -17,14 +19,19 @@ import pytest
 
 from browser import Browser
 from crowd import crowd, cycles
-from drives import DEMO, DRIVES, Drive
+from drives import DEMO, DRIVES, TILE, Drive
+from eqrt.core.frames import Pose2
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.output.datagrams import DatagramPublisher
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
+from eqrt.runtime.prediction.tiles import load_tile
 from processes import PATIENCE_S, Heard, Serving, playing
 from viewing import CHANNELS, Viewing, artifact
 
+TILE_ID = load_tile(TILE).info.tile_id
+FULL_SERVICE = "e.words === 'Full service: model, map and ego motion'"
+"""What a machine that does much else says now and then only."""
 LOGS = {"ngsim": DRIVES["ngsim"].log, "rav4": DEMO / "rav4.log.gz"}
 
 
@@ -105,7 +112,7 @@ def test_traffic_with_a_map_is_shown_and_moves(
 ) -> None:
     browser.open(ngsim[0].address)
     wait(browser, "e.agents.length > 15 && e.ghosts > 10 && e.score && e.lanes > 0")
-    assert shown(browser, "words") == "Full service: model, map and ego motion"
+    wait(browser, FULL_SERVICE)
     before = {agent["id"]: agent for agent in shown(browser, "agents")}
     time.sleep(1.0)
     after = {agent["id"]: agent for agent in shown(browser, "agents")}
@@ -166,11 +173,41 @@ def test_pause_holds_the_picture_and_steps_go_through_the_last_minute(
     assert browser.console() == []
 
 
+def test_stepping_back_shows_the_lanes_of_where_it_was(browser: Browser) -> None:
+    """Also to a page that is opened after the ego vehicle has left them."""
+    here, far_away = places_far_apart()
+
+    def driven_on(forecast: ForecastSet) -> ForecastSet:
+        x_m, y_m = here if forecast.cycle < 30 else far_away
+        pose = Pose2(x_m, y_m, 0.0)
+        return replace(forecast, tile_id=TILE_ID, mode=Mode.RUN, map_from_ego=pose)
+
+    with Viewing("--tile", str(TILE)) as viewing, sending(viewing, driven_on):
+        browser.open(viewing.address)
+        wait(browser, "e.moment && e.moment.cycle < 25 && e.lanes > 0")
+        for _ in range(2):
+            wait(browser, "e.moment && e.moment.cycle > 40 && e.kept > 40 && e.lanes > 0")
+            browser.press("p")
+            scrub_to(browser, 0)
+            wait(browser, "e.moment.cycle < 20 && e.lanes > 0")
+            browser.open(viewing.address)
+        assert browser.console() == []
+
+
+def places_far_apart() -> tuple[list[float], list[float]]:
+    """On two lanes of the demo's tile."""
+    lane_map = load_tile(TILE).lane_map
+    starts = [lane_map.lane_points(lane)[0].tolist() for lane in range(lane_map.num_lanes)]
+    far_away = max(starts, key=lambda start: math.dist(start, starts[0]))
+    assert math.dist(far_away, starts[0]) > 1_000.0
+    return starts[0], far_away
+
+
 def test_a_click_selects_an_agent_and_shows_its_numbers(
     browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
 ) -> None:
     browser.open(ngsim[0].address)
-    wait(browser, "e.agents.length > 5 && e.ghosts > 10")
+    wait(browser, f"e.agents.length > 5 && e.ghosts > 10 && {FULL_SERVICE}")
     browser.press("p")
     wait(browser, "e.paused")
     agent = browser.evaluate(
@@ -240,8 +277,8 @@ def test_wheel_drag_and_keys_move_the_view(
 def test_traffic_without_a_map_says_so(browser: Browser) -> None:
     with watched(DRIVES["rav4"], LOGS["rav4"]) as (viewing, _, _):
         browser.open(viewing.address)
-        wait(browser, "e.agents.length > 2 && e.words.includes(' for ')")
-        assert shown(browser, "words").startswith("No map here: predicting without lanes, for ")
+        wait(browser, "e.agents.length > 2")
+        wait(browser, "e.words.startsWith('No map here: predicting without lanes, for ')")
         assert shown(browser, "lanes") == 0
         assert "no map" in text(browser, "#what")
         browser.screenshot(artifact("view-without-a-map.png"))
@@ -278,6 +315,8 @@ def test_before_anything_comes_it_says_what_to_run_and_goes_on_by_itself(browser
             wait(browser, "e.agents.length === 8")
             wait(browser, "document.getElementById('notice').hidden")
         wait(browser, "e.words.startsWith('Nothing heard of the service, for ')")
+        assert re.fullmatch(r"stopped \d+ s ago", text(browser, "#when"))
+        assert browser.evaluate("return document.querySelector('#live.now')") is None
     wait(browser, "e.words === 'Connection to eqrt view lost'")
     assert "eqrt view" in text(browser, "#notice")
     browser.screenshot(artifact("view-connection-lost.png"))
@@ -337,12 +376,17 @@ def test_a_file_plays_pauses_and_can_be_gone_through(browser: Browser, tmp_path:
 def test_dark_and_narrow(browser: Browser, ngsim: tuple[Viewing, Heard, Serving]) -> None:
     """Nothing is cut off sideways, and colours are those of the dark."""
     browser.emulate(prefers_color_scheme="dark")
-    browser.resize(800, 1000)
     browser.open(ngsim[0].address)
     wait(browser, "e.agents.length > 5")
-    browser.screenshot(artifact("view-dark-narrow.png"))
-    for element in ("document.documentElement", "document.getElementById('panels')"):
-        assert browser.evaluate(f"return {element}.scrollWidth <= {element}.clientWidth")
+    for width, height, name in ((800, 1000, "view-dark-narrow"), (390, 844, "view-dark-phone")):
+        browser.resize(width, height)
+        wait(browser, f"innerWidth === {width}")
+        browser.screenshot(artifact(f"{name}.png"))
+        for element in ("document.documentElement", "document.getElementById('panels')"):
+            assert browser.evaluate(f"return {element}.scrollWidth <= {element}.clientWidth")
+        outside = "[...document.querySelectorAll('button, output, #scrub')].filter((part) => "
+        outside += f"part.getBoundingClientRect().right > {width}).length"
+        assert browser.evaluate(f"return {outside}") == 0
     shade = browser.evaluate("return getComputedStyle(document.body).backgroundColor")
     assert shade == "rgb(20, 24, 27)"
     browser.emulate(prefers_color_scheme="light")

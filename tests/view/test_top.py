@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from rich.console import Console, ConsoleDimensions
 
 from crowd import crowd, cycles
 from eqrt.cli import main
@@ -167,4 +168,19 @@ def test_the_nearest_track_comes_first_and_no_screen_is_too_small() -> None:
     state.take(crowd(0, 64), 0.0)
     ranges_m = [track.range_m for track in state.shown()]
     assert ranges_m == sorted(ranges_m)
-    render(state, 3, 0.0)
+    render(state, ConsoleDimensions(80, 3), 0.0)
+
+
+def test_a_narrow_terminal_has_fewer_columns_and_none_is_cut() -> None:
+    state = State(address="here")
+    state.take(crowd(0, 12), 0.0)
+    for width, last in ((80, "3s"), (66, "age ms"), (30, "range m v")):
+        console = Console(width=width, height=30)
+        with console.capture() as capture:
+            console.print(render(state, console.size, 0.0))
+        lines = capture.get().splitlines()
+        heading = next(line for line in lines if line.lstrip().startswith("track"))
+        assert heading.rstrip().endswith(last)
+        assert "…" not in heading
+        assert max(map(len, lines)) <= width
+        assert lines[-1].startswith("q quit")

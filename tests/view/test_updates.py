@@ -129,6 +129,7 @@ def test_lanes_are_told_around_the_ego_vehicle_and_again_when_it_has_driven_on()
     again = lanes.near(there(300.0))
     assert again is not None
     assert json.loads(again)["number"] == told["number"] + 1
+    assert list(lanes.recent) == [first, again]  # for a page that comes now and steps back
 
 
 def test_the_map_is_the_one_that_the_service_says(tmp_path: Path) -> None:
@@ -144,6 +145,9 @@ def test_the_map_is_the_one_that_the_service_says(tmp_path: Path) -> None:
     assert lanes.hear(status_with(TILE, "0ddba11")).endswith("its lanes may differ")
     assert lanes.hear(status_with(TILE, tile.info.tile_id)) == ""
     assert lanes.near(there) is not None
+    assert len(lanes.recent) == 1
+    assert lanes.hear(status_with(TILE, "0ddba12"))
+    assert not lanes.recent  # of the map before
 
 
 def status_with(tile: Path, tile_id: str) -> ServiceStatus:

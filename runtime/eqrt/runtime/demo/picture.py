@@ -1,12 +1,12 @@
 """A picture of one moment, as SVG: lanes, where everybody came from, predictions and the truth.
 
-Colours are of the Okabe-Ito palette, which colour-blind readers can tell apart; lines differ in
-dash as well.
+It is turned so that the traffic goes to the right: a road fills a wide picture, and seldom points
+east. Colours are of the Okabe-Ito palette, which colour-blind readers can tell apart; lines differ
+in width and dash as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from html import escape
 
@@ -20,11 +20,13 @@ MARGIN_PX = 24
 LEGEND_PX = 64
 _LANE, _LANE_EDGE = "#c9c9c9", "#efefef"
 _STYLES = {  # what -> colour, width in px, dash, label
-    "history": ("#333333", 2.0, "", "history, 2 s"),
-    "constant velocity": ("#56b4e9", 1.8, "2 4", "constant velocity, 3 s"),
-    "truth": ("#0072b2", 3.0, "", "what happened, 3 s"),
-    "predicted": ("#d55e00", 3.0, "7 4", "eqrt's prediction, 3 s"),
+    "history": ("#777777", 2.0, "", "history, 2 s"),
+    "truth": ("#56b4e9", 8.0, "", "what happened, 3 s"),
+    "constant velocity": ("#333333", 1.8, "2 4", "constant velocity, 3 s"),
+    "predicted": ("#d55e00", 2.5, "", "eqrt's prediction, 3 s"),
 }
+_ENDS_PX = {"constant velocity": 2.5, "predicted": 4.0}
+"""Radius of the dot at the end of a line: how far it is from the end of the truth is the error."""
 
 
 @dataclass(slots=True)
@@ -40,16 +42,23 @@ class Moment:
     ego: Float64 | None = None
     """(2,)"""
 
+    def drawn(self) -> list[Float64]:
+        """Everything but the lanes, each (n, 2) or (2,)."""
+        lines = [line for lines in self.lines.values() for line in lines]
+        return [*self.agents, *lines, *([] if self.ego is None else [self.ego])]
+
 
 def render(moment: Moment) -> str:
     """The SVG text. Raises ValueError if there is nothing to draw."""
-    shown = [*moment.agents, *(line for lines in moment.lines.values() for line in lines)]
-    if not shown:
+    if not moment.agents and not any(moment.lines.values()):
         raise ValueError("nothing to draw: no agent and no line")
-    view = _View.around(shown if moment.ego is None else [*shown, moment.ego])
+    view = _View.around(moment)
     body = [_lane(view, lane) for lane in moment.lanes]
     for name, (color, width, dash, _) in _STYLES.items():
-        body += [_polyline(view, line, color, width, dash) for line in moment.lines.get(name, [])]
+        lines = moment.lines.get(name, [])
+        body += [_polyline(view, line, color, width, dash) for line in lines]
+        if name in _ENDS_PX:
+            body += [_dot(view, line[-1], color, _ENDS_PX[name]) for line in lines]
     body += [_dot(view, position, "#333333", 4.0) for position in moment.agents]
     if moment.ego is not None:
         body.append(_dot(view, moment.ego, "#009e73", 7.0))
@@ -58,31 +67,52 @@ def render(moment: Moment) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """Metres to pixels, y up."""
+    """Metres to pixels: turned, then y up."""
 
+    right: Float64
+    """(2,) unit vector in the map that points to the right of the picture."""
     left_m: float
     top_m: float
+    """Of the picture's corner, turned."""
     px_per_m: float
     height_px: float
 
     @classmethod
-    def around(cls, lines: Iterable[Float64]) -> _View:
-        points = np.concatenate([np.atleast_2d(line) for line in lines])
-        low, high = points.min(axis=0), points.max(axis=0)
+    def around(cls, moment: Moment) -> _View:
+        points = np.concatenate([np.atleast_2d(line) for line in moment.drawn()])
+        right = _way_of_the_traffic(moment.lines.get("truth", []), points)
+        turned = points @ _turn(right)
+        low, high = turned.min(axis=0), turned.max(axis=0)
         size = np.maximum(high - low, 20.0)
-        size[1] = max(size[1], 0.25 * size[0])  # a straight road still gets a readable strip
-        scale = (WIDTH_PX - 2 * MARGIN_PX) / size[0]
-        scale = min(scale, (WIDTH_PX - 2 * MARGIN_PX) / size[1])
+        size[1] = max(size[1], 0.14 * size[0])  # a straight road still gets a readable strip
+        scale = (WIDTH_PX - 2 * MARGIN_PX) / size.max()
         center = (low + high) / 2
         height = size[1] * scale + 2 * MARGIN_PX + LEGEND_PX
         left = center[0] - WIDTH_PX / 2 / scale
         top = center[1] + (size[1] / 2 + (MARGIN_PX + LEGEND_PX) / scale)
-        return cls(float(left), float(top), float(scale), float(height))
+        return cls(right, float(left), float(top), float(scale), float(height))
 
     def pixels(self, points: Float64) -> Float64:
-        return np.stack(
-            [(points[..., 0] - self.left_m), (self.top_m - points[..., 1])], axis=-1
-        ) * (self.px_per_m)
+        turned = points @ _turn(self.right)
+        return self.px_per_m * np.stack(
+            [turned[..., 0] - self.left_m, self.top_m - turned[..., 1]], axis=-1
+        )
+
+
+def _way_of_the_traffic(truth: list[Float64], points: Float64) -> Float64:
+    """(2,) unit vector along the longer side of what is drawn, as most of the traffic goes."""
+    offsets = points - points.mean(axis=0)
+    along: Float64 = np.linalg.svd(offsets, full_matrices=False)[2][0]
+    if np.abs(offsets @ along).max() < 10.0:
+        return np.array([1.0, 0.0])  # all at one place
+    moved = sum((line[-1] - line[0] for line in truth), start=np.zeros(2))
+    backwards = moved @ along < 0.0 or (moved @ along == 0.0 and along[0] < 0.0)
+    return -along if backwards else along
+
+
+def _turn(right: Float64) -> Float64:
+    """(2, 2) that row vectors are multiplied with."""
+    return np.array([[right[0], -right[1]], [right[1], right[0]]])
 
 
 def _head(view: _View) -> str:
@@ -135,7 +165,23 @@ def _legend(view: _View, moment: Moment) -> list[str]:
             f'<circle cx="{x + 8:.0f}" cy="46" r="7" fill="#009e73"/>'
             f'<text x="{x + 22:.0f}" y="51" font-size="14">ego</text>'
         )
-    return [*parts, *_scale_bar(view)]
+    return [*parts, *_north(view), *_scale_bar(view)]
+
+
+def _north(view: _View) -> list[str]:
+    """An arrow, above the scale bar's left end."""
+    x, y = WIDTH_PX - MARGIN_PX - 20.0 * view.px_per_m - 44.0, 38.0
+    east, north = float(view.right[1]), float(view.right[0])  # of north, turned
+    tip, tail = (x + 14 * east, y - 14 * north), (x - 14 * east, y + 14 * north)
+    side = (5 * north, 5 * east)
+    corners = " ".join(
+        f"{a:.1f},{b:.1f}" for a, b in (tip, (x - side[0], y - side[1]), (x + side[0], y + side[1]))
+    )
+    return [
+        f'<line x1="{tail[0]:.1f}" y1="{tail[1]:.1f}" x2="{x:.1f}" y2="{y:.1f}" stroke="#333333"/>',
+        f'<polygon points="{corners}" fill="#333333"/>',
+        f'<text x="{x - 28:.1f}" y="{y + 5:.1f}" font-size="14">N</text>',
+    ]
 
 
 def _scale_bar(view: _View) -> list[str]:

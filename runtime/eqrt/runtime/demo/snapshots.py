@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from eqrt.runtime.demo.picture import Moment
 from eqrt.runtime.demo.score import Scored
-from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.prediction.tiles import Tile
 
 Float64 = NDArray[np.float64]
@@ -43,7 +43,8 @@ class BestMoment:
         if self._best is None:
             return None
         then, scored, histories = self._best
-        moment = Moment(title=f"{len(scored)} agents, mode {then.mode.name}")
+        limited = "" if then.mode is Mode.RUN else f", mode {then.mode.name}"
+        moment = Moment(title=f"{len(scored)} agents{limited}")
         for s in scored:
             start = histories[s.track_id][-1][None]
             for name, line in (

@@ -38,8 +38,8 @@ class Live:
         outbox.tell(
             "hello", encode_text("hello", mode="live", server=SERVER_ID, address=self._address)
         )
-        if self._lanes.message:
-            outbox.tell("lanes", self._lanes.message)
+        for place, lanes in enumerate(self._lanes.recent):
+            outbox.tell(f"lanes {place}", lanes)
         outbox.tell("statuses", encode_text("statuses", statuses=list(self._statuses)))
         if self._said:
             outbox.tell("trouble", encode_text("trouble", words=self._said))

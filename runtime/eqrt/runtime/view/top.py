@@ -10,10 +10,11 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import accumulate, islice
 from typing import Literal
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleDimensions, Group, RenderableType
 from rich.live import Live as LiveDisplay
 from rich.table import Table
 from rich.text import Text
@@ -50,9 +51,9 @@ _COLUMNS = (  # heading, alignment, width
     ("speed m/s", "right", 11),
     ("mode", "left", 13),
     ("age ms", "right", 6),
-    ("off 1 s", "right", 7),
-    ("2 s", "right", 5),
-    ("3 s", "right", 5),
+    ("off 1s", "right", 6),
+    ("2s", "right", 5),
+    ("3s", "right", 5),
 )
 
 
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
                 for key in typed:
                     state.press(key)
                 if typed or time.monotonic() >= due_s:
-                    display.update(render(state, console.height, time.monotonic()), refresh=True)
+                    display.update(render(state, console.size, time.monotonic()), refresh=True)
                     due_s = time.monotonic() + _REDRAW_S
     return 0
 
@@ -186,14 +187,16 @@ class State:
         return sorted(chosen, key=SORTS[self.sort])
 
 
-def render(state: State, height: int, now_s: float) -> RenderableType:
-    """The whole screen, of `height` lines."""
+def render(state: State, size: ConsoleDimensions, now_s: float) -> RenderableType:
+    """The whole screen."""
     head = [*_head(state, now_s), Text()]
+    for line in head:
+        line.no_wrap, line.overflow = True, "ellipsis"
     if state.cycle is None:
         return Group(*head, Text("q quit", "dim"))
     foot = _foot(state)
-    room = max(1, height - len(head) - 5)
-    return Group(*head, _table(state.shown(), room, sort=state.sort), foot)
+    room = max(1, size.height - len(head) - 5)
+    return Group(*head, _table(state.shown(), room, size.width, sort=state.sort), foot)
 
 
 def _head(state: State, now_s: float) -> list[Text]:
@@ -210,7 +213,7 @@ def _head(state: State, now_s: float) -> list[Text]:
         words += f", for {for_s:.0f} s"
     if not state.paused and now_s - state.heard_s > _SILENT_S:
         mark, style = _MARKS[BAD]
-        words = f"Nothing heard of the service for {now_s - state.heard_s:.0f} s"
+        words = f"Nothing heard of the service for {now_s - state.heard_s:.0f} s; before that:"
     lines = [Text.assemble((f" {mark} ", f"{style} reverse"), " ", (words, "bold"))]
     if state.paused:
         lines[0].append("   paused", "bold magenta")
@@ -227,7 +230,8 @@ def _service_lines(state: State) -> list[Text]:
     if status is None:
         return [Text("The service has said nothing about itself yet", "dim")]
     rate = f"{len(status.latencies_s) / status.seconds:.1f} predictions/s"
-    text = f"{status.messages / status.seconds:.0f} messages/s in, {rate}"
+    up = "".join(f" on {bus.channel}" for bus in status.buses if bus.state == "UP")
+    text = f"{status.messages / status.seconds:.0f} messages/s in{up}, {rate}"
     if state.latencies_s:
         p50, p99 = 1e3 * np.quantile(list(state.latencies_s), [0.5, 0.99])
         text += f", latency {p50:.1f} ms (99 % within {p99:.1f})"
@@ -243,7 +247,12 @@ def _service_lines(state: State) -> list[Text]:
         if not source.valid
     ]
     if found := drops(status.totals):
-        lines.append(Text(", ".join(f"{n} {words}" for words, n in found.items()), "yellow"))
+        lines.append(
+            Text(
+                "Since the start: " + ", ".join(f"{words}: {n}" for words, n in found.items()),
+                "yellow",
+            )
+        )
     return lines
 
 
@@ -256,15 +265,18 @@ def _score_line(score: Score) -> Text:
     )
 
 
-def _table(tracks: list[Track], room: int, *, sort: str) -> Table:
+def _table(tracks: list[Track], room: int, width: int, *, sort: str) -> Table:
+    """As many of the columns as have room beside each other."""
+    ends = accumulate(wide + 1 for _, _, wide in _COLUMNS)
+    columns = [column for column, end in zip(_COLUMNS, ends, strict=True) if end <= width + 1]
     table = Table(box=None, header_style="bold", padding=(0, 1, 0, 0), expand=False)
-    for name, side, width in _COLUMNS:
+    for name, side, wide in columns:
         mark = " v" if name.startswith(sort) else ""
         justify: Literal["left", "right"] = "right" if side == "right" else "left"
-        table.add_column(name + mark, justify=justify, width=width, no_wrap=True)
+        table.add_column(name + mark, justify=justify, width=wide, no_wrap=True)
     for track in tracks[:room]:
         style = {GOOD: "", BAD: "red"}.get(track.level, "dim")
-        table.add_row(*_cells(track), style=style)
+        table.add_row(*islice(_cells(track), len(columns)), style=style)
     if len(tracks) > room:
         table.add_row("...", f"{len(tracks) - room} more")
     return table
@@ -287,7 +299,8 @@ def _foot(state: State) -> Text:
     of = f"{len(state.shown())} of {len(state.tracks)} tracks"
     filtered = f' with "{state.pattern}"' if state.pattern else ""
     keys = "q quit  p pause  f filter  s sort"
-    return Text(f"{of}{filtered}; off: metres from where it was predicted to be\n{keys}", "dim")
+    words = f"{of}{filtered}; off: metres from where it was predicted to be\n{keys}"
+    return Text(words, "dim", no_wrap=True, overflow="ellipsis")
 
 
 def _tracks(now: ForecastSet, ghosts: Ghosts) -> list[Track]:

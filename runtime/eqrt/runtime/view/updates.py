@@ -186,7 +186,13 @@ def encode_lanes(tile: Tile, *, centre: tuple[float, float], radius_m: float, nu
     ]
     info = tile.info
     return _text(
-        "lanes", number=number, origin=centre, lanes=lanes, name=info.name, credit=info.credit
+        "lanes",
+        number=number,
+        origin=centre,
+        lanes=lanes,
+        tile=info.tile_id,
+        name=info.name,
+        credit=info.credit,
     )
 
 

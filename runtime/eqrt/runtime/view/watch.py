@@ -18,6 +18,8 @@ KEPT_BYTES = 64 << 20
 LANES_M = 500.0
 """How far from the ego vehicle lanes are shown."""
 _LANES_STEP_M = 200.0  # how far it drives before it gets others
+LANES_KEPT = 10
+"""As many as the page keeps (`scene.mjs`): a minute at 120 km/h."""
 
 
 class Watch:
@@ -101,8 +103,8 @@ class Lanes:
         self._centre: tuple[float, float] | None = None
         self.number = -1
         """Of the newest message."""
-        self.message: str | None = None
-        """The newest, for whoever joins."""
+        self.recent: deque[str] = deque(maxlen=LANES_KEPT)
+        """Of the last minute's ways, the newest last, for whoever joins."""
 
     def hear(self, status: ServiceStatus) -> str:
         """Take the map that the service says it uses; returns what is wrong with it, or ""."""
@@ -111,6 +113,7 @@ class Lanes:
         self._heard = status.tile_id
         try:
             self._tile, self._centre = load_tile(Path(status.tile)), None
+            self.recent.clear()
         except EqrtError as error:
             return f"no lanes are shown: {error}"
         if self._tile.info.tile_id != status.tile_id:
@@ -128,10 +131,9 @@ class Lanes:
             return None
         self._centre = position
         self.number += 1
-        self.message = encode_lanes(
-            self._tile, centre=position, radius_m=LANES_M, number=self.number
-        )
-        return self.message
+        told = encode_lanes(self._tile, centre=position, radius_m=LANES_M, number=self.number)
+        self.recent.append(told)
+        return told
 
 
 def _whereabouts(forecast: ForecastSet) -> tuple[float, float] | None:

@@ -54,10 +54,10 @@ DROPS = {
     "ego_refused": "ego values that are not possible",
     "tracks_refused": "measurements that are not possible",
     "tracks_dropped": "tracks dropped: too many",
-    "tracks_resets": "times that all tracks were forgotten",
+    "tracks_resets": "all tracks forgotten",
     "pipeline_shed": "predictions without the model: no time",
     "pipeline_fallbacks": "predictions without the model: it failed",
-    "pipeline_model_restarts": "times that the model was loaded anew",
+    "pipeline_model_restarts": "model loaded anew",
 }
 """Counter of the service (docs/output.md) -> what it counts. All are 0 when all is well."""
 

@@ -1,7 +1,7 @@
 // The page: what comes in, what is shown, what keys and buttons do.
 
 import { Camera, TURNS } from "./camera.mjs";
-import { set, showBanner, showScore, showSelected, showService } from "./panels.mjs";
+import { STALE_S, ago, set, showBanner, showScore, showSelected, showService } from "./panels.mjs";
 import { Scene, egoAt } from "./scene.mjs";
 import { showSigns } from "./signs.mjs";
 import { openStream } from "./stream.mjs";
@@ -54,7 +54,7 @@ function hear(message) {
       greet(message);
       break;
     case "lanes":
-      scene.lanes = decodeLanes(message);
+      scene.addLanes(decodeLanes(message));
       if (timeline.mode === "file") timeline.lanes = message.number;
       break;
     case "status":
@@ -82,7 +82,7 @@ function greet(message) {
     page.timeline = ofFile ? new FileTimeline((wanted) => stream.ask(wanted)) : new LiveTimeline();
     page.statuses = [];
     page.trouble = "";
-    scene.lanes = null;
+    scene.laneSets = [];
     by("speed").hidden = !ofFile;
   }
   page.hello = message;
@@ -150,6 +150,7 @@ function panels() {
   const { timeline, moment } = page;
   const now = seconds();
   const silent = timeline.mode === "live" && timeline.live && !timeline.empty ? now - timeline.arrived : 0;
+  const stopped = page.lost || silent > STALE_S;
   page.words = showBanner({
     lost: page.lost, hello: page.hello, moment, silent,
     status: page.statuses.at(-1), waiting: now - page.opened,
@@ -157,27 +158,29 @@ function panels() {
   showService(page.statuses, moment, timeline.mode, page.trouble ? [page.trouble] : [], scene.colours);
   showScore(moment?.cycle.score ?? null);
   showSelected(moment, page.selected);
-  showTransport(timeline);
+  showTransport(timeline, stopped ? now - timeline.arrived : 0);
   sayTurn();
   sayFollow();
 }
 
-function showTransport(timeline) {
+/** `stopped`: for how long nothing has come that should, s; 0 if all is well. */
+function showTransport(timeline, stopped) {
   set("play", timeline.playing ? "Pause" : "Play");
-  by("live").classList.toggle("now", timeline.live);
+  by("live").classList.toggle("now", timeline.live && !stopped);
   for (const id of ["play", "back", "forward", "scrub", "live"]) by(id).disabled = timeline.empty;
   if (timeline.empty) return set("when", "");
   const span = timeline.last - timeline.first;
   if (document.activeElement !== by("scrub") || timeline.playing) {
     by("scrub").value = span && !timeline.live ? (1000 * (timeline.time - timeline.first)) / span : 1000;
   }
-  return set("when", when(timeline));
+  return set("when", when(timeline, stopped));
 }
 
-function when(timeline) {
+function when(timeline, stopped) {
   if (timeline.mode === "file") {
     return `${clock(timeline.time - timeline.first)} of ${clock(timeline.last - timeline.first)}${timeline.done ? "" : " …"}`;
   }
+  if (timeline.live && stopped) return `stopped ${ago(stopped)} ago`;
   if (timeline.live) return `live, ${timeline.delay.toFixed(2)} s ago`;
   return `${(timeline.last - timeline.time).toFixed(1)} s ago`;
 }
@@ -269,10 +272,11 @@ addEventListener("keydown", (event) => {
   if (inScrub && event.key.startsWith("Arrow")) return;
   let name = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
   if (event.shiftKey && (name === "back" || name === "forward")) name += "Second";
-  if (event.key === "Tab" && event.target === by("scene") && page.selected !== null) {
+  const onPicture = event.target === by("scene") || event.target === document.body;
+  if (event.key === "Tab" && onPicture && page.selected !== null) {
     name = event.shiftKey ? "previous" : "next";
   }
-  if (event.key === "Enter" && event.target === by("scene")) name = "next";
+  if (event.key === "Enter" && onPicture) name = "next";
   if (!name || (event.target.tagName === "BUTTON" && (event.key === " "))) return;
   event.preventDefault();
   act(name);
@@ -351,7 +355,7 @@ window.eqrt = {
   get selected() { return page.selected; },
   get ghosts() { return page.moment ? page.moment.cycle.ghosts.filter((v) => v !== -32768).length / 2 : 0; },
   get score() { return page.moment?.cycle.score ?? null; },
-  get lanes() { return page.moment?.cycle.on_map ? scene.lanes?.lanes.length ?? 0 : 0; },
+  get lanes() { return scene.lanesDrawn; },
   get labels() { return scene.labels.boxes ?? []; },
   get pixels() { return scene.agents.map(({ id, px, py }) => ({ id, px, py })); },
   get camera() { return { scale: camera.scale, follow: camera.follow, axis: camera.axis }; },

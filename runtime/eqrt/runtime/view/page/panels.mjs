@@ -3,7 +3,7 @@
 import { drawHistogram, drawSpark } from "./charts.mjs";
 
 const MARKS = { good: "✓", limited: "!", bad: "✕", lost: "✕", waiting: "…" };
-const STALE_S = 2;
+export const STALE_S = 2;
 const by = (id) => document.getElementById(id);
 const number = (value, digits, unit) =>
   value === null || value === undefined ? "not known" : `${value.toFixed(digits)} ${unit}`;
@@ -109,7 +109,7 @@ function serviceTroubles(status) {
 }
 
 function sinceStart(status) {
-  return Object.entries(status?.drops ?? {}).map(([words, count]) => `since the start, ${count} ${words}`);
+  return Object.entries(status?.drops ?? {}).map(([words, count]) => `since the start, ${words}: ${count}`);
 }
 
 /** What is wrong now, then what once was. */

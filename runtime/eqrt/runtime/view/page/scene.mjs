@@ -12,6 +12,7 @@ const SIZES = { // metres, where the sensor tells none: drawn dashed
 const DOT_M = 1; // radius of an object of which neither size nor class is known
 const EGO_M = [4.6, 1.9];
 const LEAST_PX = 5; // nobody is drawn smaller
+const LANES_KEPT = 10; // a minute at 120 km/h
 const TURNED_BACK = Math.PI;
 
 /** Draws moments on a canvas. */
@@ -20,7 +21,7 @@ export class Scene {
     this.canvas = canvas;
     this.context = canvas.getContext("2d", { alpha: false });
     this.labels = new Labels();
-    this.lanes = null;
+    this.laneSets = []; // around places that were driven through, the newest last
     this.ghosts = true;
     this.agents = []; // of the last picture: { id, row, x, y, px, py }
     this.readColours();
@@ -43,6 +44,19 @@ export class Scene {
     camera.resize(clientWidth, clientHeight);
   }
 
+  /** Takes the lanes around another place; those of another map are gone. */
+  addLanes(lanes) {
+    const others = this.laneSets.filter(({ tile, number }) => tile === lanes.tile && number !== lanes.number);
+    this.laneSets = [...others, lanes].slice(-LANES_KEPT);
+  }
+
+  /** The lanes around where a cycle was, or null. */
+  lanesAt(cycle) {
+    if (!cycle.on_map) return null;
+    const away = ({ origin }) => Math.hypot(origin[0] - cycle.origin[0], origin[1] - cycle.origin[1]);
+    return this.laneSets.reduce((best, one) => (!best || away(one) <= away(best) ? one : best), null);
+  }
+
   /** Draws one moment; `selected` is a track id or null. `past(s)` is the cycle s seconds before. */
   draw(moment, camera, selected, past) {
     const { context, colours } = this;
@@ -50,10 +64,12 @@ export class Scene {
     context.fillStyle = colours.ground;
     context.fillRect(0, 0, this.canvas.width, this.canvas.height);
     this.agents = [];
+    this.lanesDrawn = 0;
     if (!moment) return;
     const { cycle } = moment;
     this.#place(moment, camera);
-    if (this.lanes && cycle.on_map) this.#drawLanes(camera);
+    const lanes = this.lanesAt(cycle);
+    if (lanes) this.#drawLanes(lanes, camera);
     context.setTransform(...camera.transform(...cycle.origin, this.ratio));
     this.#drawLines(cycle, camera.scale, selected);
     const row = cycle.rows.get(selected);
@@ -119,18 +135,19 @@ export class Scene {
   /** How far the ring around a selected agent is from its middle. */
   #ring(agent) { return Math.max(agent.long, 9) + 5; }
 
-  #drawLanes(camera) {
-    const { context, colours, lanes } = this;
+  #drawLanes(lanes, camera) {
+    const { context, colours } = this;
     const [x0, y0, x1, y1] = camera.box;
     const [ox, oy] = lanes.origin;
     const path = new Path2D();
     for (const { points, box } of lanes.lanes) {
       if (box[0] + ox > x1 || box[2] + ox < x0 || box[1] + oy > y1 || box[3] + oy < y0) continue;
+      this.lanesDrawn += 1;
       path.moveTo(points[0], points[1]);
       for (let i = 2; i < points.length; i += 2) path.lineTo(points[i], points[i + 1]);
     }
     context.setTransform(...camera.transform(ox, oy, this.ratio));
-    context.lineJoin = "round";
+    context.lineJoin = context.lineCap = "round"; // no gaps where one lane goes on in another
     context.strokeStyle = colours.lane;
     context.lineWidth = LANE_M;
     context.stroke(path);
