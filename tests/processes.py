@@ -83,6 +83,11 @@ class Serving:
                 return found[1]
         raise AssertionError(self.end())
 
+    def stop_reading(self) -> None:
+        """Close our end of its standard output."""
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
     def send(self, number: signal.Signals) -> None:
         """A signal."""
         self._process.send_signal(number)

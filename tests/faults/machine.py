@@ -108,6 +108,8 @@ class Served:
     """Where the service is in this process."""
     folder: Path = Path()
     """`model` and `map.tile`, where they are copies."""
+    stop_reading: Callable[[], None] | None = None
+    """Have its log go nowhere, where it talks."""
 
 
 @dataclass(frozen=True)
@@ -330,10 +332,38 @@ def disk_fills_up(world: World) -> Iterator[str]:
 
 
 @contextlib.contextmanager
+def log_not_read(world: World) -> Iterator[str]:
+    """The pipe that it goes to is full."""
+    pipe = os.open(f"/proc/{world.pid}/fd/1", os.O_WRONLY | os.O_NONBLOCK)
+    filled = 0
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            filled += os.write(pipe, b"\n")
+    os.close(pipe)
+    yield f"{filled} bytes"
+
+
+@contextlib.contextmanager
+def log_reader_gone(world: World) -> Iterator[str]:
+    """Its end of the pipe is closed."""
+    assert world.service.stop_reading is not None
+    world.service.stop_reading()
+    yield "1 pipe"
+
+
+@contextlib.contextmanager
 def served_in_a_process(channel: str, heard: Heard) -> Iterator[Served]:
     """`eqrt serve` as it is."""
     with Serving(*_options(channel, heard)) as service:
         yield Served(service.pid)
+
+
+@contextlib.contextmanager
+def served_talking(channel: str, heard: Heard) -> Iterator[Served]:
+    """With a line every second, which goes into a pipe."""
+    options = [option for option in _options(channel, heard) if option != "--quiet"]
+    with Serving(*options) as service:
+        yield Served(service.pid, stop_reading=service.stop_reading)
 
 
 @contextlib.contextmanager
@@ -406,6 +436,8 @@ FAULTS: dict[str, tuple[float, Fault, Callable[[str, Heard], AbstractContextMana
     "the tile file is damaged": (2.0, tile_file_damaged, served_from_files),
     "the tile is exchanged under way": (3.0, tile_exchanged, served_from_files),
     "the recorder is killed": (2.0, recorder_killed, served_and_recorded),
+    "nobody reads the log": (3.0, log_not_read, served_talking),
+    "the log's reader goes away": (3.0, log_reader_gone, served_talking),
     "the disk fills up": (6.0, disk_fills_up, served_and_recorded_into_little_room),
 }
 

@@ -7,6 +7,7 @@ from typing import TextIO
 
 from eqrt.runtime.bus.health import LOST, BusWord
 from eqrt.runtime.operation.event_log import EventLog, Level
+from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 
@@ -31,7 +32,7 @@ class BusTeller:
 
     def __init__(self, log: EventLog, errors: TextIO) -> None:
         self._log = log
-        self._errors = None if log.goes_to(errors) else errors
+        self._errors = None if log.goes_to(errors) else Outlet(errors)
 
     def __call__(self, word: BusWord) -> None:
         """Say it, as often as the log admits."""
@@ -44,7 +45,7 @@ class BusTeller:
             state=word.state.name,
         )
         if said and self._errors is not None:
-            print(f"eqrt serve: {word.text}", file=self._errors, flush=True)
+            self._errors.put(f"eqrt serve: {word.text}")
 
 
 @dataclass(frozen=True, slots=True)

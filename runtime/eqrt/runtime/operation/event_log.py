@@ -1,7 +1,8 @@
 """The service's log: one line for every event, as text for people or as JSON for machines.
 
 The same event is said a few times a minute at most; how often it was left out is said with the
-next one. So whatever happens on a bus cannot fill a disk.
+next one. So whatever happens on a bus cannot fill a disk. Whoever reads the log cannot hold up the
+service either: lines that are not taken are left out, and that is said later.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 from typing import Any, TextIO
+
+from eqrt.runtime.operation.outlet import Outlet
 
 PER_MINUTE = 6
 """Lines of one event at most."""
@@ -62,7 +65,8 @@ class EventLog:
         """
         self.is_json = form == "json"
         self._level = level
-        self._stream = sys.stdout if stream is None else stream
+        self._outlet = Outlet(sys.stdout if stream is None else stream)
+        self._untaken = 0
         self._clock = clock
         self._for_journal = "JOURNAL_STREAM" in environment
         self._windows: dict[str, _Window] = {}
@@ -85,17 +89,14 @@ class EventLog:
 
     def goes_to(self, stream: TextIO) -> bool:
         """Whether what is written to that stream stands among the log's lines."""
-        try:
-            return os.path.sameopenfile(self._stream.fileno(), stream.fileno())
-        except (OSError, ValueError):  # one of them is no file, or closed
-            return self._stream is stream
+        return self._outlet.leads_to(stream)
 
     def line(self, event: str, text: str, **fields: Any) -> None:
         """A line that is always said: the status of a second, the first and the last one."""
         if self.is_json:
             self._write(Level.INFO, event, text, fields)
         else:
-            print(text, file=self._stream, flush=True)
+            self._put(text)
 
     def _admit(self, event: str) -> int | None:
         """How many were left out before this one; None = this one is left out, too."""
@@ -112,12 +113,25 @@ class EventLog:
         return 0
 
     def _write(self, level: Level, event: str, text: str, fields: dict[str, Any]) -> None:
+        self._put(self._formed(level, event, text, fields))
+
+    def _put(self, line: str) -> None:
+        """Nobody is waited for: what is not taken is counted, and said when lines are again."""
+        if self._untaken:
+            text = f"{self._untaken} lines are missing here: nobody took them"
+            fields = {"untaken": self._untaken}
+            if not self._outlet.put(self._formed(Level.WARNING, "log", text, fields)):
+                self._untaken += 1
+                return
+            self._untaken = 0
+        if not self._outlet.put(line):
+            self._untaken += 1
+
+    def _formed(self, level: Level, event: str, text: str, fields: dict[str, Any]) -> str:
         if self.is_json:
             now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
             told = {"time": now, "level": level.name.lower(), "event": event, "text": text}
-            line = json.dumps(told | fields, ensure_ascii=False)
-        else:
-            prefix = f"<{level:d}>" if self._for_journal else f"{time.strftime('%H:%M:%S')} "
-            said = "" if level is Level.INFO else f"{level.name.lower()}: "
-            line = f"{prefix}{said}{text}"
-        print(line, file=self._stream, flush=True)
+            return json.dumps(told | fields, ensure_ascii=False)
+        prefix = f"<{level:d}>" if self._for_journal else f"{time.strftime('%H:%M:%S')} "
+        said = "" if level is Level.INFO else f"{level.name.lower()}: "
+        return f"{prefix}{said}{text}"
