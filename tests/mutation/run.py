@@ -121,7 +121,8 @@ def _difference(module: str, mutant: str) -> str:
     }
     name = mutant.rpartition(".")[2]
     original = f"{name.rpartition('_')[0]}_orig"
-    changed = difflib.ndiff(places[original][1:], places[name][1:])
+    unnamed = ["\n".join(places[one]).replace(one, "", 1).splitlines() for one in (original, name)]
+    changed = difflib.ndiff(*unnamed)
     return "\n".join(line for line in changed if line[:2] in ("- ", "+ "))
 
 

@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from can_recordings import detections_of, feed_all, messages_of
-from eqrt.core.errors import UsageError
 from eqrt.runtime.decoding.can_io import Decoder, Event
-from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import builtin_profiles, load_profile
 from soundness import assert_sound
 
@@ -136,28 +134,3 @@ def test_every_fate_of_a_message_has_its_counter() -> None:
         "objects": 1,
         "invalid_objects": 31,
     }
-
-
-@pytest.mark.parametrize("channel", ["0", 0])
-def test_a_numbered_channel_may_be_spelled_as_text(channel: str | int) -> None:
-    """Logs and interfaces differ in whether a channel is 0 or '0'; some do not say."""
-    decoder = Decoder(PROFILES["generic"], {"car": channel})
-    for spelled in ("0", 0, None):
-        (message,) = encode_cycle(timestamp_s=0.0, speed_mps=1.0, channel=spelled)
-        assert len(decoder.feed(message, 0.0)) == 1
-
-
-@pytest.mark.parametrize(
-    ("channels", "complaint"),
-    [
-        ({"radar": "can0"}, "has no channel for its bus 'car'"),
-        ({"radar": "can0", "car": "can1", "lidar": "can2"}, "has no bus 'lidar'"),
-    ],
-)
-def test_roles_without_channels_and_channels_without_roles_are_refused(
-    channels: dict[str, str | int], complaint: str
-) -> None:
-    with pytest.raises(UsageError) as refusal:
-        Decoder(PROFILES["toyota-rav4"], channels)
-    assert complaint in str(refusal.value)
-    assert "--can radar=CHANNEL --can car=CHANNEL" in str(refusal.value)

@@ -65,6 +65,23 @@ def test_the_gear_turns_the_speed_around_while_it_is_fresh(
     assert motion.speed_mps == pytest.approx(speed)
 
 
+@pytest.mark.parametrize(("gear_s", "speed"), [(4.0, -10.0), (5.0, -10.0), (5.25, 10.0)])
+def test_what_is_fresh_is_no_older_than_the_limit_and_not_from_the_future(
+    tmp_path: Path, gear_s: float, speed: float
+) -> None:
+    """After the clock was set back nobody knows how old the gear is; times are exact in binary."""
+    gear = message(GEAR, bytes([2]))
+    (motion,) = feed(tmp_path, [(gear_s, gear), (5.0, ego(36.0, 36.0))])
+    assert isinstance(motion, EgoMotion)
+    assert motion.speed_mps == pytest.approx(speed)
+
+
+def test_standing_still_is_something_to_tell(tmp_path: Path) -> None:
+    (motion,) = feed(tmp_path, [(5.0, ego(0.0, 0.0))])
+    assert isinstance(motion, EgoMotion)
+    assert (motion.speed_mps, motion.yaw_rate_rad_s) == (0.0, 0.0)
+
+
 def test_a_value_marked_not_available_is_none(tmp_path: Path) -> None:
     (motion,) = feed(tmp_path, [(5.0, ego(36.0, 36.0, -3276.8))])
     assert isinstance(motion, EgoMotion)
@@ -87,6 +104,85 @@ def test_a_message_cut_short_tells_what_is_in_it(tmp_path: Path) -> None:
 
 def test_an_empty_message_tells_nothing(tmp_path: Path) -> None:
     assert feed(tmp_path, [(5.0, message(EGO, b""))]) == []
+
+
+POSE = """
+description = "a pose in the map, with the speed and how old both are"
+
+[[ego]]
+bus = "car"
+dbc = "tiny.dbc"
+messages = { age = "GEAR", pose = "EGO" }
+latency_s = 0.25
+hold_s = 1.0
+
+[ego.fields]
+x = { signal = "pose.LEFT", unit = "m" }
+y = { signal = "pose.RIGHT", unit = "m", sign = -1 }
+yaw = { signal = "pose.YAW_RATE", unit = "deg" }
+speed = "pose.LEFT"
+age = { signal = "age.GEAR", unit = "ms" }
+"""
+
+PLACE = (
+    POSE.replace(
+        'x = { signal = "pose.LEFT", unit = "m" }',
+        'latitude = { signal = "pose.LEFT", unit = "deg" }',
+    )
+    .replace(
+        'y = { signal = "pose.RIGHT", unit = "m", sign = -1 }',
+        'longitude = { signal = "pose.RIGHT", unit = "deg" }',
+    )
+    .replace("yaw =", "heading =")
+)
+
+
+def told(folder: Path, *messages: can.Message, text: str = POSE) -> list[Event]:
+    """What the messages tell that come at 8 s."""
+    decoder = decoder_of(folder, text)
+    return [event for one in messages for event in decoder.feed(one, 8.0)]
+
+
+def test_a_message_may_tell_motion_and_pose_of_one_time(tmp_path: Path) -> None:
+    """Measured 250 ms (latency) and 125 ms (age) before it came."""
+    motion, pose = told(tmp_path, message(GEAR, bytes([125])), ego(36.0, 20.0, 200.0))
+    assert isinstance(motion, EgoMotion)
+    assert isinstance(pose, EgoPose)
+    assert motion.timestamp_s == pose.timestamp_s == 8.0 - 0.25 - 0.125
+    assert (motion.speed_mps, motion.yaw_rate_rad_s) == (pytest.approx(10.0), None)
+    assert (pose.map_from_ego.x_m, pose.map_from_ego.y_m) == pytest.approx((36.0, -20.0))
+    assert pose.map_from_ego.yaw_rad == pytest.approx(math.radians(-160.0))
+
+
+def test_without_an_age_only_the_latency_is_taken_off(tmp_path: Path) -> None:
+    motion, pose = told(tmp_path, ego(36.0, 20.0))
+    assert motion.timestamp_s == pose.timestamp_s == 7.75
+
+
+@pytest.mark.parametrize("bytes_left", [0, 1, 2, 3, 4, 5])
+def test_a_pose_that_is_cut_short_is_none(tmp_path: Path, bytes_left: int) -> None:
+    cut = ego(36.0, 20.0)
+    cut.data = cut.data[:bytes_left]
+    assert [type(event) for event in told(tmp_path, cut)] == [EgoMotion] * (bytes_left >= 2)
+
+
+@pytest.mark.parametrize(
+    ("latitude_deg", "longitude_deg", "is_place"),
+    [(89.9, 179.9, True), (90.1, 8.0, False), (49.0, 180.1, False), (49.0, 8.0, True)],
+)
+def test_only_places_on_earth_are_told(
+    tmp_path: Path, latitude_deg: float, longitude_deg: float, is_place: bool
+) -> None:
+    _, *poses = told(tmp_path, ego(latitude_deg, longitude_deg), text=PLACE)
+    assert len(poses) == is_place
+
+
+@pytest.mark.parametrize("bytes_left", [2, 3, 4, 5])
+def test_a_place_that_is_cut_short_is_none(tmp_path: Path, bytes_left: int) -> None:
+    cut = ego(49.0, 8.0)
+    cut.data = cut.data[:bytes_left]
+    (motion,) = told(tmp_path, cut, text=PLACE)
+    assert isinstance(motion, EgoMotion)
 
 
 def sbg_messages(
@@ -157,3 +253,17 @@ def test_a_fix_that_is_not_accurate_is_not_told() -> None:
     accuracy.data[0:2] = (250).to_bytes(2, "little")  # 2.5 m
     for one in (*others, accuracy):
         assert decoder.feed(one, 1.0) == []
+
+
+def test_the_map_may_get_another_origin_under_way() -> None:
+    decoder = Decoder(load_profile("sbg-ins"), map_origin_deg=(49.0, 8.4))
+    assert decoder.set_map_origin((49.0, 8.401))
+    pose = pose_of(decoder, sbg_messages(49.0, 8.401, 0.0))
+    assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=0.011)
+    assert decoder.set_map_origin(None)
+    pose = pose_of(decoder, sbg_messages(49.2, 8.6, 0.0))
+    assert (pose.x_m, pose.y_m) == (0.0, 0.0)
+
+
+def test_an_origin_is_of_no_use_to_poses_that_are_in_the_map_already() -> None:
+    assert not Decoder(load_profile("generic")).set_map_origin((49.0, 8.4))

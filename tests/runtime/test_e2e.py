@@ -230,6 +230,23 @@ def test_more_lost_messages_than_allowed_are_a_wrong_sequence(max_delta: int) ->
         assert sequence.follow((251 + delta) % 256) is Status.OK
 
 
+@pytest.mark.parametrize("modulus", [4, 15, 16, 256])
+def test_less_than_half_the_range_may_be_lost_unless_it_is_said(modulus: int) -> None:
+    """Beyond that, a gap and a step back look alike; AUTOSAR's profile 1 counts to fourteen."""
+    for delta in range(2, modulus):
+        sequence = Sequence(modulus)
+        sequence.follow(1)
+        expected = Status.SOME_LOST if 2 * delta < modulus else Status.WRONG_SEQUENCE
+        assert sequence.follow((1 + delta) % modulus) is expected
+
+
+def test_a_damaged_message_stands_for_one_lost_one_only() -> None:
+    sequence = Sequence(16)
+    sequence.follow(3)
+    sequence.skip()
+    assert sequence.follow(6) is Status.SOME_LOST
+
+
 def test_a_damaged_message_is_not_missing_in_the_next_one() -> None:
     sent = messages_of(P5, 12, 5)
     checker = Checker(P5)
@@ -242,6 +259,13 @@ def test_after_silence_any_counter_will_do() -> None:
     sequence = Sequence(16, silence_s=0.5)
     statuses = [sequence.follow(n, at_s) for n, at_s in ((3, 0.0), (9, 0.6), (9, 1.0), (10, -5.0))]
     assert statuses == [Status.OK, Status.OK, Status.REPEATED, Status.OK]
+
+
+@pytest.mark.parametrize("since_s", [0.5, -0.5])
+def test_just_as_long_as_the_limit_is_no_silence(since_s: float) -> None:
+    sequence = Sequence(16, silence_s=0.5)
+    sequence.follow(3, 1.0)
+    assert sequence.follow(3, 1.0 + since_s) is Status.REPEATED
 
 
 def test_only_new_messages_that_came_as_sent_are_usable() -> None:

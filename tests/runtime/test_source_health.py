@@ -77,10 +77,11 @@ def test_it_says_why_and_since_when() -> None:
     for i in range(MAX_WRONG):
         health.judge(False, 0.3 + i * STEP_S)
     health.refuse()
+    health.refuse()
     report = health.report
     assert report.reason == "wrong checksums or counters"
     assert report.since_s == pytest.approx(0.7)
-    assert (report.name, report.right, report.wrong, report.refused) == ("radar", 3, 5, 1)
+    assert (report.name, report.right, report.wrong, report.refused) == ("radar", 3, 5, 2)
 
 
 def test_silence_ends_with_the_first_right_one() -> None:
@@ -99,7 +100,16 @@ def test_silence_is_noticed_when_it_ends_too() -> None:
     health = SourceHealth("radar", 0.5)
     health.judge(True, 0.0)
     assert health.judge(True, 5.0)
-    assert health.report.silences == 1
+    assert health.judge(True, 10.0)
+    assert health.report.silences == 2
+
+
+@pytest.mark.parametrize("since_s", [0.5, -0.5])
+def test_just_as_long_as_the_limit_is_no_silence(since_s: float) -> None:
+    health = SourceHealth("radar", 0.5)
+    health.judge(True, 1.0)
+    assert not health.expire(1.0 + since_s)
+    assert health.expire(1.0 + 1.001 * since_s)
 
 
 def test_silence_does_not_excuse_what_was_wrong_before() -> None:

@@ -33,12 +33,13 @@ def crc_of(bits: int, polynomial: int, start: int, final_xor: int) -> Crc:
     """A function that computes the check of `bits` (8 or 16) with these parameters."""
     if (bits, polynomial) == (16, CCITT):  # the one that the standard library has in C
         return lambda data: binascii.crc_hqx(data, start) ^ final_xor
-    table, mask, high = _table(bits, polynomial), (1 << bits) - 1, bits - 8
+    table, behind = _table(bits, polynomial), bits - 8  # the register's first byte, the bits behind
+    rest = (1 << behind) - 1
 
     def crc(data: bytes) -> int:
         value = start
         for byte in data:
-            value = (value << 8 & mask) ^ table[(value >> high) ^ byte]
+            value = (value & rest) << 8 ^ table[value >> behind ^ byte]
         return value ^ final_xor
 
     return crc
