@@ -121,8 +121,10 @@ def _difference(module: str, mutant: str) -> str:
     }
     name = mutant.rpartition(".")[2]
     original = f"{name.rpartition('_')[0]}_orig"
-    unnamed = ["\n".join(places[one]).replace(one, "", 1).splitlines() for one in (original, name)]
-    changed = difflib.ndiff(*unnamed)
+    before, after = (
+        "\n".join(places[one]).replace(one, "", 1).splitlines() for one in (original, name)
+    )
+    changed = difflib.ndiff(before, after)
     return "\n".join(line for line in changed if line[:2] in ("- ", "+ "))
 
 

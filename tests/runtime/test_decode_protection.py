@@ -167,6 +167,7 @@ class TestProtectedList:
                 one.arbitration_id = swap.get(one.arbitration_id, one.arbitration_id)
             detections = detections_of(feed_all(decoder, cycle))
             assert all(len(one.object_id) == 0 for one in detections)
+        assert decoder.counters.bad_checksum == 20 * 2 * len(CARS)
         assert report_of(decoder).state is SourceState.WRONG
         assert report_of(decoder, "ego EGO_MOTION").valid
 
@@ -470,6 +471,15 @@ class TestProfileKeys:
         ]
         assert told == [1, 1, 0, 1, 1, 0, 1, 1]
         assert decoder.counters.bad_counter == 4
+
+    def test_a_counter_begins_again_behind_its_last_number_and_after_silence(
+        self, tmp_path: Path
+    ) -> None:
+        """Eight bits. After more than half a second the sender may be one that has just started."""
+        decoder = decoder_of(tmp_path, COUNTING_EGO)
+        for at_s, counter in ((0.0, 255), (0.1, 0), (0.7, 100), (1.3, 100)):
+            assert len(decoder.feed(message(GEAR, bytes([counter])), at_s)) == 1
+        assert decoder.counters.bad_counter == 0
 
     def test_a_message_too_short_for_its_counter_tells_nothing(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTING_EGO)

@@ -107,6 +107,8 @@ def test_many_rows_at_once_have_the_checks_that_each_has(seed: int, count: int, 
     rows = np.random.default_rng(seed).integers(0, 256, (count, width)).astype(np.uint8)
     data_id, data_ids = seed & 0xFFFF, data_ids_of(seed)
     fives, twos = crc_p5_rows(rows, data_id), crc_p2_rows(rows, data_ids)
+    assert fives.dtype == np.uint16
+    assert twos.dtype == np.uint8
     for row, five, two in zip(rows, fives, twos, strict=True):
         data = bytearray(row.tobytes())
         Profile5(data_id=data_id).protect(data, data[2])
@@ -230,6 +232,13 @@ def test_more_lost_messages_than_allowed_are_a_wrong_sequence(max_delta: int) ->
         assert sequence.follow((251 + delta) % 256) is Status.OK
 
 
+def test_a_checker_allows_as_many_lost_messages_as_it_is_told() -> None:
+    sent = messages_of(P5, 12, 4)
+    for max_delta, expected in ((2, Status.WRONG_SEQUENCE), (3, Status.SOME_LOST)):
+        checker = Checker(P5, max_delta=max_delta)
+        assert [checker.check(one) for one in (sent[0], sent[3])] == [Status.OK, expected]
+
+
 @pytest.mark.parametrize("modulus", [4, 15, 16, 256])
 def test_less_than_half_the_range_may_be_lost_unless_it_is_said(modulus: int) -> None:
     """Beyond that, a gap and a step back look alike; AUTOSAR's profile 1 counts to fourteen."""
@@ -271,6 +280,16 @@ def test_just_as_long_as_the_limit_is_no_silence(since_s: float) -> None:
 def test_only_new_messages_that_came_as_sent_are_usable() -> None:
     assert [one for one in Status if one.is_usable] == [Status.OK, Status.SOME_LOST]
     assert [one for one in Status if one.is_stale] == [Status.REPEATED, Status.WRONG_SEQUENCE]
+
+
+def test_data_ids_that_are_not_given_come_from_the_messages_id() -> None:
+    """Whoever receives our messages has them from the pages, and must come to the same ones."""
+    assert data_id_of(0x18FF06E4) == 0x06E4
+    assert data_ids_of(0x6E4).hex() == "e4f404142434445464748494a4b4c4d4"
+
+
+def test_a_sender_begins_with_zero() -> None:
+    assert P5.counter(Sender(P5).protect(bytes(12))) == 0
 
 
 def test_a_sender_counts_on_from_where_it_is_told() -> None:
