@@ -42,5 +42,6 @@ def assert_consistent(cycle: Detections) -> None:
         cycle.existence,
     ):
         assert values.shape == (count,)
+    assert cycle.object_id.dtype == np.int64
     assert cycle.is_new.dtype == np.bool_
     assert cycle.object_class.dtype == np.uint8

@@ -109,12 +109,17 @@ valid = "first.STATE != 0"
 )
 
 
+_LOADED: dict[tuple[str, str], Profile] = {}
+
+
 def profile_of(folder: Path, text: str, dbc: str = DBC) -> Profile:
-    """The profile that a user would have in a folder, beside its DBC."""
+    """The profile that a user would have in a folder, beside its DBC; read once in all tests."""
     (folder / "tiny.dbc").write_text(dbc)
     path = folder / "tiny.toml"
     path.write_text(text)
-    return load_profile(str(path))
+    if (text, dbc) not in _LOADED:
+        _LOADED[text, dbc] = load_profile(str(path))
+    return _LOADED[text, dbc]
 
 
 def decoder_of(folder: Path, text: str) -> Decoder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
 from eqrt.runtime.decoding.profile import load_profile
-from tiny_sensor import EGO, GEAR, decoder_of, message
+from tiny_sensor import DBC, EGO, GEAR, decoder_of, message, profile_of
 
 SBG_DBC = Path(eqrt.runtime.decoding.profile.__file__).parent / "dbc" / "sbg" / "sbgCan.dbc"
 
@@ -106,6 +107,7 @@ def test_an_empty_message_tells_nothing(tmp_path: Path) -> None:
     assert feed(tmp_path, [(5.0, message(EGO, b""))]) == []
 
 
+EXACT, THREE = 0x170, (("A", 0), ("B", 64), ("C", 128))
 POSE = """
 description = "a pose in the map, with the speed and how old both are"
 
@@ -124,22 +126,30 @@ speed = "pose.LEFT"
 age = { signal = "age.GEAR", unit = "ms" }
 """
 
-PLACE = (
-    POSE.replace(
-        'x = { signal = "pose.LEFT", unit = "m" }',
-        'latitude = { signal = "pose.LEFT", unit = "deg" }',
-    )
-    .replace(
-        'y = { signal = "pose.RIGHT", unit = "m", sign = -1 }',
-        'longitude = { signal = "pose.RIGHT", unit = "deg" }',
-    )
-    .replace("yaw =", "heading =")
+EXACT_DBC = (
+    f"{DBC}BO_ {EXACT} EXACT: 24 R\n"
+    + "".join(f' SG_ {name} : {at}|64@1- (1,0) [0|0] "rad" R\n' for name, at in THREE)
+    + "\n"
+    + "".join(f"SIG_VALTYPE_ {EXACT} {name} : 2;\n" for name, _ in THREE)
+)
+PLACE = """
+description = "a pose in three numbers that the message has as a float has them"
+
+[[ego]]
+bus = "car"
+dbc = "tiny.dbc"
+messages = { place = "EXACT" }
+fields = { latitude = "A", longitude = "B", heading = "C" }
+"""
+PLACE_IN_MAP = PLACE.replace(
+    'latitude = "A", longitude = "B", heading = "C"',
+    'x = { signal = "A", unit = "m" }, y = { signal = "B", unit = "m" }, yaw = "C"',
 )
 
 
-def told(folder: Path, *messages: can.Message, text: str = POSE) -> list[Event]:
+def told(folder: Path, *messages: can.Message) -> list[Event]:
     """What the messages tell that come at 8 s."""
-    decoder = decoder_of(folder, text)
+    decoder = decoder_of(folder, POSE)
     return [event for one in messages for event in decoder.feed(one, 8.0)]
 
 
@@ -160,30 +170,38 @@ def test_without_an_age_only_the_latency_is_taken_off(tmp_path: Path) -> None:
     assert motion.timestamp_s == pose.timestamp_s == 7.75
 
 
-@pytest.mark.parametrize("bytes_left", [0, 1, 2, 3, 4, 5])
-def test_a_pose_that_is_cut_short_is_none(tmp_path: Path, bytes_left: int) -> None:
-    cut = ego(36.0, 20.0)
-    cut.data = cut.data[:bytes_left]
-    assert [type(event) for event in told(tmp_path, cut)] == [EgoMotion] * (bytes_left >= 2)
+def exact(folder: Path, text: str, *numbers: float) -> list[Event]:
+    """What a message with these three numbers tells."""
+    decoder = Decoder(profile_of(folder, text, EXACT_DBC))
+    return decoder.feed(message(EXACT, struct.pack("<3d", *numbers)), 0.0)
 
 
+@pytest.mark.parametrize("text", [PLACE, PLACE_IN_MAP])
+@pytest.mark.parametrize("without", [(0,), (1,), (2,), (0, 1), (0, 1, 2)])
+def test_a_pose_that_lacks_a_number_is_none(
+    tmp_path: Path, text: str, without: tuple[int, ...]
+) -> None:
+    assert len(exact(tmp_path, text, 0.5, 0.25, 0.125)) == 1
+    numbers = [math.nan if i in without else 0.5 for i in range(3)]
+    assert exact(tmp_path, text, *numbers) == []
+
+
+@pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(
-    ("latitude_deg", "longitude_deg", "is_place"),
-    [(89.9, 179.9, True), (90.1, 8.0, False), (49.0, 180.1, False), (49.0, 8.0, True)],
+    ("latitude_rad", "longitude_rad", "is_place"),
+    [
+        (math.pi / 2, 1.0, True),
+        (math.nextafter(math.pi / 2, 2.0), 1.0, False),
+        (1.0, math.pi, True),
+        (1.0, math.nextafter(math.pi, 4.0), False),
+    ],
 )
 def test_only_places_on_earth_are_told(
-    tmp_path: Path, latitude_deg: float, longitude_deg: float, is_place: bool
+    tmp_path: Path, sign: int, latitude_rad: float, longitude_rad: float, is_place: bool
 ) -> None:
-    _, *poses = told(tmp_path, ego(latitude_deg, longitude_deg), text=PLACE)
-    assert len(poses) == is_place
-
-
-@pytest.mark.parametrize("bytes_left", [2, 3, 4, 5])
-def test_a_place_that_is_cut_short_is_none(tmp_path: Path, bytes_left: int) -> None:
-    cut = ego(49.0, 8.0)
-    cut.data = cut.data[:bytes_left]
-    (motion,) = told(tmp_path, cut, text=PLACE)
-    assert isinstance(motion, EgoMotion)
+    """The poles are, and the far side of Greenwich."""
+    told = exact(tmp_path, PLACE, sign * latitude_rad, sign * longitude_rad, 0.0)
+    assert len(told) == is_place
 
 
 def sbg_messages(
@@ -259,8 +277,8 @@ def test_a_fix_that_is_not_accurate_is_not_told() -> None:
 def test_the_map_may_get_another_origin_under_way() -> None:
     decoder = Decoder(load_profile("sbg-ins"), map_origin_deg=(49.0, 8.4))
     assert decoder.set_map_origin((49.0, 8.401))
-    pose = pose_of(decoder, sbg_messages(49.0, 8.401, 0.0))
-    assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=0.011)
+    pose = pose_of(decoder, sbg_messages(49.0, 8.402, 0.0))
+    assert (pose.x_m, pose.y_m) == pytest.approx((73.17, 0.0), abs=0.02)
     assert decoder.set_map_origin(None)
     pose = pose_of(decoder, sbg_messages(49.2, 8.6, 0.0))
     assert (pose.x_m, pose.y_m) == (0.0, 0.0)

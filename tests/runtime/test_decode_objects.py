@@ -13,6 +13,7 @@ import pytest
 from can_recordings import detections_of
 from eqrt.runtime.decoding.can_io import Decoder
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
+from soundness import assert_consistent
 from tiny_sensor import (
     COUNTED,
     DBC,
@@ -28,7 +29,7 @@ from tiny_sensor import (
 )
 
 NAN = math.nan
-RICH = 0x160
+RICH, PAIR = 0x160, 0x161
 RICH_DBC = (
     f"{DBC}BO_ {RICH} RICH: 16 R\n"
     ' SG_ RANGE : 0|32@1- (1,0) [0|0] "m" R\n'
@@ -40,6 +41,10 @@ RICH_DBC = (
     ' SG_ QUALITY : 100|4@1+ (1,0) [0|0] "" R\n'
     ' SG_ VX : 104|8@1- (0.5,0) [0|0] "m/s" R\n'
     ' SG_ VY : 112|8@1- (0.5,0) [0|0] "m/s" R\n\n'
+    f"BO_ {PAIR} PAIR: 8 R\n"
+    ' SG_ X1 : 0|8@1+ (1,0) [0|0] "m" R\n'
+    ' SG_ X2 : 8|8@1+ (1,0) [0|0] "m" R\n'
+    ' SG_ COUNTER : 16|4@1+ (1,0) [0|0] "" R\n\n'
     f"SIG_VALTYPE_ {RICH} RANGE : 1;\nSIG_VALTYPE_ {RICH} AZIMUTH : 1;\n"
 )
 RICH_TOML = (
@@ -73,7 +78,10 @@ def rich(
 
 
 def feed(decoder: Decoder, messages: list[can.Message], at_s: float = 0.0) -> list[Detections]:
-    return detections_of([event for one in messages for event in decoder.feed(one, at_s)])
+    cycles = detections_of([event for one in messages for event in decoder.feed(one, at_s)])
+    for cycle in cycles:
+        assert_consistent(cycle)
+    return cycles
 
 
 def decoded(folder: Path, one: can.Message, text: str = RICH_TOML) -> Detections:
@@ -158,26 +166,26 @@ def test_an_object_that_is_nowhere_is_left_out(
     assert len(cycle.existence) == len(cycle.object_class) == len(cycle.is_new) == 0
 
 
-@pytest.mark.parametrize("places", [[0], [1], [0, 2]])
+@pytest.mark.parametrize(("num_objects", "places"), [(3, [0]), (3, [1]), (3, [0, 2]), (2, [0, 1])])
 def test_objects_in_slots_are_numbered_on_from_slot_to_slot(
-    tmp_path: Path, places: list[int]
+    tmp_path: Path, num_objects: int, places: list[int]
 ) -> None:
-    """Three objects in a message: those of slot 5 are 15, 16 and 17; an empty place counts too."""
+    """With three in a message those of slot 5 are 15, 16 and 17; an empty place counts too."""
     text = (
         SENSOR
         + """
 framing = "slots"
 slots = { first = 5, last = 5 }
-objects = { first = 1, last = 3 }
+objects = { first = 1, last = LAST }
 messages = { objects = "PACKED" }
 fields = { x = "O{object}_X", y = "O{object}_Y", valid = "O{object}_ID != 0" }
 """
-    )
+    ).replace("LAST", str(num_objects))
     data = bytearray(24)
     for place in places:
         data[5 * place : 5 * place + 5] = struct.pack("<hhB", 100 * place, 200, 1)
     (cycle,) = feed(decoder_of(tmp_path, text), [message(PACKED, bytes(data))])
-    assert cycle.object_id.tolist() == [15 + place for place in places]
+    assert cycle.object_id.tolist() == [5 * num_objects + place for place in places]
     assert cycle.position.tolist() == [[float(place), 2.0] for place in places]
 
 
@@ -211,6 +219,7 @@ def test_an_objects_counter_may_have_fewer_bits_than_the_headers(tmp_path: Path)
     seconds = [second(0, 4.0, slot=i) for i in range(4)]
     (cycle,) = feed(decoder, [header(0x35), *firsts, *seconds])
     assert cycle.object_id.tolist() == [0, 1, 3]
+    assert cycle.timestamp_s == 0.0
 
 
 @pytest.mark.parametrize("counters", [(4, 6), (15, 1), (4, 4)])
@@ -265,3 +274,115 @@ def test_the_last_of_two_second_messages_counts(tmp_path: Path) -> None:
     messages = [header(3), first(1, 0, 7), first(2, 0, 8), first(3, 0, 9)]
     (cycle,) = feed(decoder, [*messages, second(8, 1.0), second(7, 2.0), second(8, 3.0)])
     np.testing.assert_array_equal(cycle.length_m, [2.0, 3.0, NAN])
+
+
+def test_second_messages_that_did_not_come_leave_nothing_in_their_place(tmp_path: Path) -> None:
+    decoder = decoder_of(tmp_path, COUNTED)
+    objects = [first(1, 0, 7), first(2, 0, 8), first(3, 0, 9)]
+    feed(decoder, [header(3), *objects, second(9, 1.0), second(7, 2.0)])
+    (cycle,) = detections_of(decoder.poll(1.0))
+    np.testing.assert_array_equal(cycle.length_m, [2.0, NAN, 1.0])
+
+
+def test_of_many_second_messages_with_one_id_the_last_counts(tmp_path: Path) -> None:
+    """So many that a sort which does not keep their order would show."""
+    decoder = decoder_of(tmp_path, COUNTED)
+    lengths = [0.1 * i for i in range(100)]
+    messages = [header(100), *(first(1.0, 0, i) for i in range(100))]
+    (cycle,) = feed(decoder, messages + [second(i % 2, lengths[i]) for i in range(100)])
+    assert cycle.length_m[:2] == pytest.approx(lengths[-2:])
+
+
+def test_every_lost_cycle_is_counted(tmp_path: Path) -> None:
+    decoder = decoder_of(tmp_path, COUNTED)
+    feed(decoder, [header(0, counter) for counter in (1, 3, 5, 7, 8)])
+    assert (decoder.counters.bad_counter, decoder.sources[0].wrong) == (3, 3)
+
+
+def test_a_damaged_object_does_not_hide_that_a_cycle_was_lost(tmp_path: Path) -> None:
+    """The header's counter could be read."""
+    text = COUNTED.replace(
+        '"FIRST_00", counter = "COUNTER"', '"FIRST_00", checksum = { kind = "xor8" }'
+    )
+    decoder = decoder_of(tmp_path, text)
+    for counter in (1, 3):
+        feed(decoder, [header(1, counter), first(1, 0, 7, state=1), second(7, 4.0)])
+    assert (decoder.counters.bad_checksum, decoder.counters.bad_counter) == (2, 1)
+
+
+BEHIND = '{ signal = "first.RATE", unit = "m" }'
+WITHOUT_CONDITION = COUNTED.replace('valid = "first.STATE != 0"\n', "")
+
+
+@pytest.mark.parametrize(
+    ("num_bytes", "text"),
+    [
+        (6, COUNTED.replace('"first.X"', BEHIND)),
+        (6, COUNTED.replace('{ signal = "first.Y", sign = -1 }', BEHIND)),
+        (4, WITHOUT_CONDITION),
+    ],
+    ids=["x", "y", "id"],
+)
+def test_an_object_that_lacks_its_place_or_name_is_left_out(
+    tmp_path: Path, num_bytes: int, text: str
+) -> None:
+    """Even if the profile's condition holds; the others stay."""
+    decoder = decoder_of(tmp_path, text)
+    for i in range(2):
+        cut = first(1, 2, 7, counter=i)
+        cut.data = cut.data[:num_bytes]
+        messages = [header(2, i), cut, first(1, 2, 8, counter=i), second(7, 4.0), second(8, 4.0)]
+        (cycle,) = feed(decoder, messages)
+        assert cycle.object_id.tolist() == [8]
+    assert (decoder.counters.invalid_objects, decoder.counters.objects) == (2, 2)
+
+
+def test_an_object_too_short_for_its_counter_is_not_one_of_another_cycle(tmp_path: Path) -> None:
+    decoder = decoder_of(tmp_path, WITHOUT_CONDITION)
+    cut = first(1, 2, 7)
+    cut.data = cut.data[:5]
+    (cycle,) = feed(decoder, [header(1, 3), cut, second(7, 4.0)])
+    assert cycle.object_id.tolist() == [7]
+    assert (decoder.counters.bad_counter, decoder.counters.short) == (0, 1)
+
+
+def test_counters_of_all_messages_of_an_object_are_one_count(tmp_path: Path) -> None:
+    text = SLOTS.replace(
+        'second = "SECOND_{slot:X}"',
+        'second = { message = "SECOND_{slot:X}", counter = "COUNTER" }',
+    )
+    decoder = decoder_of(tmp_path, text)
+    for counter in range(3):
+        firsts = [first(1, 0, 0, slot=slot, counter=counter) for slot in range(4)]
+        seconds = [second(0, 4.0, slot=slot, counter=counter) for slot in range(4)]
+        (cycle,) = feed(decoder, firsts + seconds, at_s=0.1 * counter)
+        assert cycle.length_m.tolist() == [4.0] * 4
+    assert decoder.counters.bad_counter == 0
+
+
+PAIRS = (
+    SENSOR
+    + """
+framing = "counted"
+objects = { first = 1, last = 2 }
+header = { message = "LIST", count = "COUNT", counter = "COUNTER" }
+messages = { pair = { message = "PAIR", counter = "COUNTER" } }
+fields = { id = "X{object}", x = "X{object}", y = "X{object}" }
+"""
+)
+
+
+@pytest.mark.parametrize(("num_foreign", "is_wrong"), [(0, False), (1, False), (2, True)])
+def test_a_message_of_another_cycle_is_one_however_many_objects_it_has(
+    tmp_path: Path, num_foreign: int, is_wrong: bool
+) -> None:
+    """Three messages of two objects each."""
+    decoder = Decoder(profile_of(tmp_path, PAIRS, RICH_DBC))
+    feed(decoder, [header(0, 4)])
+    pairs = [
+        message(PAIR, bytes([2 * i, 2 * i + 1, 4 if i < num_foreign else 5])) for i in range(3)
+    ]
+    (cycle,) = feed(decoder, [header(6, 5), *pairs])
+    assert cycle.object_id.tolist() == list(range(2 * num_foreign, 6))
+    assert decoder.counters.bad_counter == num_foreign
+    assert decoder.sources[0].wrong == is_wrong

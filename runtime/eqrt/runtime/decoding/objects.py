@@ -31,16 +31,14 @@ class ObjectDecoder:
         self._sensor = sensor
         self._fields = sensor.fields
         self._last_counter = _NAN
-        self._has_counter = False
-        self._follows = True
-        self._num_foreign = 0
+        self._begin()
         packed = np.arange(sensor.objects_per_message)
         slots = np.array(sensor.slots, np.float64)
         self._slot_ids = (slots[:, None] * len(packed) + packed).ravel()
 
     def decode(self, cycle: Cycle) -> Detections:
         """The valid objects of a cycle."""
-        self._follows, self._has_counter, self._num_foreign = True, False, 0
+        self._begin()
         with np.errstate(all="ignore"):  # a sensor may send numbers that no arithmetic survives
             detections = self._decode(cycle)
         if not self._has_counter and cycle.num_wrong:
@@ -55,12 +53,15 @@ class ObjectDecoder:
         """Any counter may come next: the last one could not be read, or is long ago."""
         self._last_counter = _NAN
 
+    def _begin(self) -> None:
+        self._follows, self._has_counter, self._num_foreign = True, False, 0
+
     def _decode(self, cycle: Cycle) -> Detections:
         counter, age_s = self._header(cycle.header)
         values = self._values(cycle, counter)
         position = self._position(values)
         object_id = self._object_id(values)
-        valid = np.isfinite(position[:, 0] + position[:, 1] + object_id)
+        valid = np.isfinite(position).all(axis=1) & np.isfinite(object_id)
         if cycle.count is not None:
             valid[cycle.count :] = False
         if self._fields.valid is not None:
@@ -155,8 +156,9 @@ class ObjectDecoder:
                 counter = self._counter_without_header(index, seen, part.counter.modulus)
             other = (seen != counter % part.counter.modulus) & ~np.isnan(seen)
             if other.any():
-                self._counters.bad_counter += int(other.sum())
-                self._num_foreign += int(other.sum()) // packed
+                num_foreign = math.ceil(other.sum() / packed)  # a message may be cut short
+                self._counters.bad_counter += num_foreign
+                self._num_foreign += num_foreign
                 values[:, other] = _NAN
         return values
 
@@ -202,14 +204,13 @@ def _joined(values: Float64, object_id: Reference, wanted: Float64) -> Float64:
     if len(ids) == len(wanted) and (ids == wanted).all():
         return values
     order = np.argsort(ids, kind="stable")
-    # The last of several messages with the same id; -1 (the NaN put there) where there is none.
+    # The last of several messages with the same id; -1 where all ids are higher.
     place = np.searchsorted(ids, wanted, side="right", sorter=order) - 1
     found = place >= 0
     found[found] = ids[order[place[found]]] == wanted[found]
-    columns = np.full(len(wanted), -1)
-    columns[found] = order[place[found]]
-    padded = np.concatenate((values, np.full((len(values), 1), _NAN)), axis=1)
-    return padded[:, columns]
+    joined = np.full((len(values), len(wanted)), _NAN)
+    joined[:, found] = values[:, order[place[found]]]
+    return joined
 
 
 def _last_of_each(object_id: Float64, valid: NDArray[np.intp]) -> NDArray[np.intp]:
