@@ -54,7 +54,8 @@ DECODING = ROOT / "runtime/eqrt/runtime/decoding"
 DBCS, E2E_TOML = DECODING / "dbc", DECODING / "profiles" / "generic-e2e.toml"
 E2E = load_profile("generic-e2e")
 CARS = [Car(object_id=i + 1, x_m=10.0 * i, y_m=3.0 * i, speed_mps=1.0) for i in range(3)]
-HEADER, POSITION, MOTION, EGO_MOTION, EGO_YAW = 0x5AB, 0x5AC, 0x5AD, 0x5A8, 0x5AA
+HEADER, POSITION, MOTION, EGO_MOTION = 0x5AB, 0x5AC, 0x5AD, 0x5A8
+EGO_POSITION, EGO_YAW = 0x5A9, 0x5AA
 CYCLE_S = 0.1
 Cycle = list[can.Message]
 
@@ -260,6 +261,18 @@ class TestWhatOneFaultCosts:
         assert len(detections_of(fed(decoder, cycles))) == 9
         assert report_of(decoder).wrong == 1
 
+    def test_a_damaged_header_ends_the_cycle_before_which_is_told(self) -> None:
+        cycles = sent(10)
+        cycles[5] = lost(cycles[5], MOTION, 2)
+        cycles[6] = changed(cycles[6], lambda one: [damaged(one)], HEADER)
+        decoder = Decoder(E2E)
+        for one in (one for cycle in cycles[:6] for one in cycle):
+            decoder.feed(one, one.timestamp)
+        told = [e for one in cycles[6] for e in decoder.feed(one, cycles[5][-1].timestamp)]
+        (detections,) = detections_of(told)
+        assert not detections.complete
+        assert len(detections.object_id) == 3
+
     def test_a_damaged_cycle(self) -> None:
         cycles = sent(10)
         cycles[5] = changed(cycles[5], lambda one: [damaged(one)], POSITION, MOTION)
@@ -297,6 +310,9 @@ class TestWhatOneFaultCosts:
         decoder = Decoder(E2E)
         assert len(detections_of(fed(decoder, cycles))) == 10
         assert report_of(decoder).wrong == 1
+        # The header, the three about the ego and the first of either kind are known as old ones;
+        # what follows these two is in sequence, but finds no open cycle.
+        assert (decoder.counters.bad_counter, decoder.counters.stray) == (6, 4)
 
 
 class TestHealth:
@@ -370,6 +386,19 @@ class TestHealth:
         assert report_of(decoder, "ego EGO_MOTION").refused == MIN_RIGHT - 1
         assert report_of(decoder, "ego EGO_YAW").valid
 
+    def test_an_ego_source_needs_all_of_its_messages(self) -> None:
+        """The position is damaged, the yaw that comes with it is not: no pose is told any more."""
+        cycles = sent(20)
+        for i in range(3, 12):
+            cycles[i] = changed(cycles[i], lambda one: [damaged(one)], EGO_POSITION)
+        decoder = Decoder(E2E)
+        states = []
+        for cycle in cycles:
+            feed_all(decoder, cycle)
+            states.append(report_of(decoder, "ego EGO_YAW").state)
+        valid, wrong = SourceState.VALID, SourceState.WRONG
+        assert states == [valid] * (3 + MAX_WRONG - 1) + [wrong] * 7 + [valid] * 6
+
     def test_a_few_damaged_objects_in_every_cycle_cost_only_themselves(self) -> None:
         cycles = sent(20)
         for cycle in cycles:
@@ -379,6 +408,10 @@ class TestHealth:
         assert [len(one.object_id) for one in detections] == [3] * 20
         assert all(np.isnan(one.velocity[-1]).all() for one in detections)
         assert decoder.counters.bad_checksum == 20
+
+
+class TestMuchTraffic:
+    """Recordings, and faults by chance."""
 
     @pytest.mark.parametrize("name", ["ars408", "rav4"])
     def test_recorded_sensors_are_valid_throughout(self, name: str) -> None:

@@ -189,8 +189,7 @@ class _SensorInput:
 
     def _open(self, data: Payload, timestamp_s: float, status: Status) -> Sequence[Event]:
         if status is _OK:
-            cycles = self._framing.open(data, timestamp_s, status)
-            return self._decoded(cycles) if cycles else ()
+            return self._decoded(self._framing.open(data, timestamp_s, status))
         return self._open_wrong(data, timestamp_s, status)
 
     def _open_wrong(self, data: Payload, timestamp_s: float, status: Status) -> Sequence[Event]:
