@@ -386,3 +386,14 @@ def test_a_message_of_another_cycle_is_one_however_many_objects_it_has(
     assert cycle.object_id.tolist() == list(range(2 * num_foreign, 6))
     assert decoder.counters.bad_counter == num_foreign
     assert decoder.sources[0].wrong == is_wrong
+
+
+def test_slots_cut_short_say_no_counter(tmp_path: Path) -> None:
+    decoder = decoder_of(tmp_path, SLOTS)
+    firsts = [first(1, 0, 0, slot=slot) for slot in range(4)]
+    for one in firsts:
+        one.data = one.data[:5]
+    (cycle,) = feed(decoder, firsts + [second(0, 4.0, slot=slot) for slot in range(4)])
+    assert cycle.complete
+    assert cycle.object_id.tolist() == []
+    assert (decoder.counters.bad_counter, decoder.counters.invalid_objects) == (0, 4)

@@ -1,7 +1,7 @@
 """Names in a profile, bound to the bits of the DBC that they mean.
 
 The messages that describe one object (or the ego vehicle) are its parts. Binding a name gives a
-`Reference`: which part, and which row of the values that are decoded from it.
+`Reference` to one of their columns.
 """
 
 from __future__ import annotations
@@ -9,70 +9,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import replace
 
 from eqrt.core.errors import ProfileError
-from eqrt.runtime.decoding.conditions import ConditionError, Evaluate, parse_condition
+from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField, Reference
+from eqrt.runtime.decoding.conditions import ConditionError, parse_condition
 from eqrt.runtime.decoding.dbc_files import DbcMessage
 from eqrt.runtime.decoding.dbc_tables import Column, Signal
 from eqrt.runtime.decoding.profile_schema import FieldTable, MeanTable, SpanTable
 from eqrt.runtime.decoding.units import FACTORS
 
-Values = Sequence[Any]
-"""By part, then by row of the part: floats, or arrays with one element per object."""
-
-_NAN = float("nan")
 _MAX_PAYLOAD_BYTES = 64  # of CAN FD
 _MAX_BITS, _FLOAT_BITS = 64, (16, 32, 64)
 _MAX_SPAN_BYTES = 8  # more than any signal in use spans; keeps the decoder to one shift
 _NUMBERED = re.compile(r"\{(slot|object)(?::(0?\d*[dxX]))?\}")
-
-
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """A column of a part."""
-
-    part: int
-    row: int
-
-
-@dataclass(frozen=True, slots=True)
-class BoundCondition:
-    """A condition of the profile, and where its operands come from."""
-
-    evaluate: Evaluate
-    operands: tuple[Reference, ...]
-
-    def holds(self, values: Values) -> Any:
-        """Truth, one per object if the values are arrays."""
-        return self.evaluate([values[operand.part][operand.row] for operand in self.operands])
-
-
-@dataclass(frozen=True, slots=True)
-class BoundField:
-    """A field of the profile in SI units: the mean of some columns, where `when` holds."""
-
-    columns: tuple[Reference, ...]
-    when: BoundCondition | None
-
-    def number(self, values: Values) -> float:
-        """The value, where `values` are floats; NaN = it is not there."""
-        if self.when is not None and not self.when.holds(values):
-            return _NAN
-        return float(self._mean(values))
-
-    def array(self, values: Values) -> NDArray[np.float64]:
-        """One value per object, where `values` are arrays; NaN = it is not there."""
-        mean: NDArray[np.float64] = self._mean(values)
-        return mean if self.when is None else np.where(self.when.holds(values), mean, _NAN)
-
-    def _mean(self, values: Values) -> Any:
-        first, *others = [values[column.part][column.row] for column in self.columns]
-        return sum(others, first) / len(self.columns) if others else first
 
 
 class Binder:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.decoding.addresses import Address, address_of
-from eqrt.runtime.decoding.bindings import Binder, BoundCondition, BoundField
+from eqrt.runtime.decoding.bindings import Binder
+from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField
 from eqrt.runtime.decoding.dbc_files import Dbc, DbcMessage
 from eqrt.runtime.decoding.dbc_tables import Column, SignalTable
 from eqrt.runtime.decoding.profile_schema import EgoMessageTable, EgoTable

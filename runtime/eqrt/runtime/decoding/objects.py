@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.runtime.decoding.bindings import BoundField, Reference
+from eqrt.runtime.decoding.bound_fields import BoundField, Reference
 from eqrt.runtime.decoding.cycles import Cycle
 from eqrt.runtime.decoding.dbc_tables import Payload
 from eqrt.runtime.decoding.decoder_counters import DecoderCounters

@@ -9,7 +9,8 @@ import numpy as np
 from eqrt.core.errors import ProfileError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.addresses import address_of
-from eqrt.runtime.decoding.bindings import Binder, BoundCondition, BoundField, Reference, fill, span
+from eqrt.runtime.decoding.bindings import Binder, fill, span
+from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField, Reference
 from eqrt.runtime.decoding.dbc_files import Dbc, DbcMessage
 from eqrt.runtime.decoding.dbc_tables import SignalTable
 from eqrt.runtime.decoding.detections import ObjectClass, VelocityKind

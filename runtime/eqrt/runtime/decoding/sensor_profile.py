@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.addresses import Address
-from eqrt.runtime.decoding.bindings import BoundCondition, BoundField, Reference
+from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField, Reference
 from eqrt.runtime.decoding.dbc_tables import Column, SignalTable
 from eqrt.runtime.decoding.detections import VelocityKind
 
