@@ -346,18 +346,33 @@ def test_an_object_too_short_for_its_counter_is_not_one_of_another_cycle(tmp_pat
     assert (decoder.counters.bad_counter, decoder.counters.short) == (0, 1)
 
 
+BOTH_COUNT = SLOTS.replace(
+    'second = "SECOND_{slot:X}"', 'second = { message = "SECOND_{slot:X}", counter = "COUNTER" }'
+)
+
+
 def test_counters_of_all_messages_of_an_object_are_one_count(tmp_path: Path) -> None:
-    text = SLOTS.replace(
-        'second = "SECOND_{slot:X}"',
-        'second = { message = "SECOND_{slot:X}", counter = "COUNTER" }',
-    )
-    decoder = decoder_of(tmp_path, text)
+    decoder = decoder_of(tmp_path, BOTH_COUNT)
     for counter in range(3):
         firsts = [first(1, 0, 0, slot=slot, counter=counter) for slot in range(4)]
         seconds = [second(0, 4.0, slot=slot, counter=counter) for slot in range(4)]
         (cycle,) = feed(decoder, firsts + seconds, at_s=0.1 * counter)
         assert cycle.length_m.tolist() == [4.0] * 4
     assert decoder.counters.bad_counter == 0
+
+
+@pytest.mark.parametrize("foreign", [[3], [2, 3]])
+def test_all_messages_of_another_cycle_count_against_the_cycle(
+    tmp_path: Path, foreign: list[int]
+) -> None:
+    """Half of its messages are too many."""
+    decoder = decoder_of(tmp_path, BOTH_COUNT)
+    counters = [4 if slot in foreign else 5 for slot in range(4)]
+    firsts = [first(1, 0, 0, slot=slot, counter=counters[slot]) for slot in range(4)]
+    seconds = [second(0, 4.0, slot=slot, counter=counters[slot]) for slot in range(4)]
+    feed(decoder, firsts + seconds)
+    assert decoder.counters.bad_counter == 2 * len(foreign)
+    assert decoder.sources[0].wrong == (len(foreign) == 2)
 
 
 PAIRS = (
