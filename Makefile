@@ -12,6 +12,7 @@ FUZZ_SECONDS ?= 60
 FUZZ_JOBS ?= 1
 FUZZ_TARGETS ?=
 MUTATION_MODULES ?=
+MUTATION_JOBS ?= 1
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
@@ -51,7 +52,7 @@ fuzz: $(FUZZ_VENV)/.installed ## fuzz every parser for FUZZ_SECONDS (60); FUZZ_T
 	@PYTHONPATH=tests $(FUZZ_VENV)/bin/python -m fuzz.run --seconds $(FUZZ_SECONDS) --jobs $(FUZZ_JOBS) $(FUZZ_TARGETS)
 
 mutation: $(MUTATION_VENV)/.installed ## change the code in every small way and see that a test notices; takes long
-	@PYTHONPATH=tests $(MUTATION_VENV)/bin/python -m mutation.run $(MUTATION_MODULES)
+	@PYTHONPATH=tests $(MUTATION_VENV)/bin/python -m mutation.run --jobs $(MUTATION_JOBS) $(MUTATION_MODULES)
 
 coverage: $(VENV)/.installed ## check that tests reach every line and branch of what `make mutation` changes
 	@PYTHONPATH=tests $(VENV)/bin/python -m mutation.cover

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,16 +62,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     known = modules()
     parser = argparse.ArgumentParser(prog="make mutation", description=__doc__)
     parser.add_argument("modules", nargs="*", help=f"of {', '.join(known)} (default: all)")
+    parser.add_argument("--jobs", type=int, default=1, help="mutants at a time (default: 1)")
     args = parser.parse_args(argv)
     unexplained = 0
     print("| module | mutants | noticed | explained | unexplained | seconds |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |", flush=True)
     for module in args.modules or known:
         began_s = time.monotonic()
-        found = _mutate(module, known[module])
+        found = _mutate(module, known[module], args.jobs)
         seconds = time.monotonic() - began_s
+        functions = _functions(module)
         alive = {
-            name: _difference(module, name)
+            name: _difference(functions, name)
             for name, state in sorted(found.items())
             if state not in _KILLED
         }
@@ -93,11 +95,11 @@ def _is_explained(module: str, difference: str) -> bool:
     )
 
 
-def _mutate(module: str, tests: Iterable[str]) -> dict[str, str]:
+def _mutate(module: str, tests: Iterable[str], jobs: int) -> dict[str, str]:
     """Mutant -> what became of it."""
     _copy_project(module, [f"tests/{test}" for test in tests])
     done = subprocess.run(
-        [*_MUTMUT, "run", "--max-children", "1"],
+        [*_MUTMUT, "run", "--max-children", str(jobs)],
         cwd=FOLDER,
         env=_environment(),
         capture_output=True,
@@ -111,19 +113,21 @@ def _mutate(module: str, tests: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def _difference(module: str, mutant: str) -> str:
-    """What the mutant changes; mutmut writes all of them, and the original, into one file."""
+def _functions(module: str) -> dict[str, str]:
+    """Name -> text; mutmut writes all mutants, and the originals, into one file."""
     lines = (FOLDER / "mutants/src/eqrt" / module).read_text().splitlines()
-    places = {
-        node.name: lines[node.lineno - 1 : node.end_lineno]
+    return {
+        node.name: "\n".join(lines[node.lineno - 1 : node.end_lineno])
         for node in ast.walk(ast.parse("\n".join(lines)))
         if isinstance(node, ast.FunctionDef)
     }
+
+
+def _difference(functions: Mapping[str, str], mutant: str) -> str:
+    """What the mutant changes."""
     name = mutant.rpartition(".")[2]
     original = f"{name.rpartition('_')[0]}_orig"
-    before, after = (
-        "\n".join(places[one]).replace(one, "", 1).splitlines() for one in (original, name)
-    )
+    before, after = (functions[one].replace(one, "", 1).splitlines() for one in (original, name))
     changed = difflib.ndiff(before, after)
     return "\n".join(line for line in changed if line[:2] in ("- ", "+ "))
 
