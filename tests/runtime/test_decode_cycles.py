@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -9,7 +10,10 @@ import pytest
 
 from can_recordings import detections_of
 from eqrt.runtime.decoding.can_io import Decoder
+from eqrt.runtime.decoding.cycles import Cycle, Framing, framing_of
+from eqrt.runtime.decoding.decoder_counters import DecoderCounters
 from eqrt.runtime.decoding.detections import Detections
+from eqrt.runtime.protection.sequence import Status
 from tiny_sensor import COUNTED, DBC, SLOTS, decoder_of, first, header, profile_of, second
 
 WITH_HEADER = SLOTS.replace(
@@ -152,3 +156,80 @@ def test_every_header_that_cannot_be_read_is_counted(tmp_path: Path) -> None:
 def test_a_cycle_of_slots_was_received_when_its_last_message_was(tmp_path: Path) -> None:
     (cycle,) = feed(decoder_of(tmp_path, SLOTS), slots(0, 1, 2, 3), at_s=1.0)
     assert (cycle.timestamp_s, cycle.received_s) == (1.0, 1.007)
+
+
+def framing(folder: Path, text: str) -> Framing:
+    return framing_of(profile_of(folder, text).sensors[0], DecoderCounters())
+
+
+STALE = [Status.REPEATED, Status.WRONG_SEQUENCE]
+
+
+@pytest.mark.parametrize("stale", [[], STALE[:1], STALE, STALE * 2])
+def test_old_messages_count_as_wrong_ones_and_take_no_objects_place(
+    tmp_path: Path, stale: list[Status]
+) -> None:
+    gathering = framing(tmp_path, COUNTED)
+    gathering.open(bytes([1, 0, 0, 0]), 0.0, Status.OK)
+    for status in (Status.OK, *stale):
+        assert gathering.add(0, 0, b"first", 0.0, status) == ()
+    (cycle,) = gathering.add(1, 0, b"second", 0.0, Status.OK)
+    assert cycle.payloads == [[b"first"], [b"second"]]
+    assert (cycle.num_messages, cycle.num_wrong) == (2 + len(stale), len(stale))
+
+
+@pytest.mark.parametrize("stale", [[], STALE[:1], STALE, STALE * 2])
+def test_old_messages_of_a_slot_that_has_come_count_as_wrong_ones(
+    tmp_path: Path, stale: list[Status]
+) -> None:
+    gathering = framing(tmp_path, SLOTS)
+    for status in (Status.OK, *stale):
+        assert gathering.add(0, 0, b"0", 0.0, status) == ()
+    others = [(0, slot) for slot in (1, 2, 3)] + [(1, slot) for slot in range(4)]
+    (cycle,) = (one for place in others for one in gathering.add(*place, b"0", 0.0, Status.OK))
+    assert cycle.payloads == [[b"0"] * 4] * 2
+    assert (cycle.num_messages, cycle.num_wrong) == (8 + len(stale), len(stale))
+
+
+@pytest.mark.parametrize("status", [Status.ERROR, Status.SOME_LOST])
+@pytest.mark.parametrize("text", [COUNTED, SLOTS])
+def test_damaged_messages_and_those_after_lost_ones_are_wrong_in_their_place(
+    tmp_path: Path, text: str, status: Status
+) -> None:
+    gathering = framing(tmp_path, text)
+    num_objects = 1 if text is COUNTED else 4
+    if text is COUNTED:
+        gathering.open(bytes([1, 0, 0, 0]), 0.0, Status.OK)
+    places = [(part, slot) for part in range(2) for slot in range(num_objects)]
+    (cycle,) = (one for place in places for one in gathering.add(*place, b"", 0.0, status))
+    assert cycle.num_messages == cycle.num_wrong == len(places)
+    assert not cycle.is_right(0)
+
+
+@pytest.mark.parametrize(
+    ("num_messages", "num_wrong", "num_foreign", "is_right"),
+    [
+        (0, 0, 0, True),
+        (0, 0, 1, False),
+        (4, 1, 0, True),
+        (4, 2, 0, False),
+        (4, 1, 1, False),
+        (5, 1, 1, True),
+        (5, 0, 3, False),
+    ],
+)
+def test_most_messages_of_a_right_cycle_are_right_and_its_header_is(
+    num_messages: int, num_wrong: int, num_foreign: int, is_right: bool
+) -> None:
+    cycle = Cycle(
+        payloads=[],
+        header=None,
+        count=None,
+        first_s=0.0,
+        last_s=0.0,
+        complete=True,
+        num_messages=num_messages,
+        num_wrong=num_wrong,
+    )
+    assert cycle.is_right(num_foreign) == is_right
+    assert not replace(cycle, header_right=False).is_right(num_foreign)

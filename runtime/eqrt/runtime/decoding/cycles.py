@@ -41,7 +41,7 @@ class Cycle:
     num_wrong: int = 0
     """Of those: damaged, out of sequence, or the first one after lost ones."""
 
-    def is_right(self, num_foreign: int = 0) -> bool:
+    def is_right(self, num_foreign: int) -> bool:
         """Whether header and most messages are; `num_foreign` more turned out to be wrong."""
         wrong = self.num_wrong + num_foreign
         return self.header_right and (not wrong or 2 * wrong < self.num_messages)
