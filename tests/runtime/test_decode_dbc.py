@@ -147,6 +147,19 @@ def test_a_short_message_gives_what_is_there() -> None:
     )
 
 
+def test_a_message_cut_anywhere_is_read_up_to_there(dbc_path: Path) -> None:
+    """All at once and one by one are two ways to read; both give the same."""
+    dbc, _ = both(dbc_path)
+    noise = random.Random(64)
+    for name, message in dbc.messages.items():
+        table, whole = table_of(dbc, name), noise.randbytes(message.length)
+        for end in range(message.length + 1):
+            cut = whole[:end]
+            expected = [column.read(cut) for column in table.columns]
+            for values in (table.decode([cut]), table.decode([cut, whole])):
+                np.testing.assert_allclose(values[:, 0], expected, rtol=1e-15)
+
+
 @given(st.integers(0, 80), st.integers(0, 80))
 def test_payloads_of_any_length_are_read_as_far_as_they_go(one: int, other: int) -> None:
     """A signal is there exactly if its last byte is."""
@@ -163,4 +176,28 @@ def test_no_messages_give_no_values() -> None:
 
 
 def test_a_table_without_columns_decodes_to_nothing() -> None:
-    assert SignalTable([]).decode([bytes(8), b""]).shape == (0, 2)
+    table = SignalTable([])
+    assert table.decode([bytes(8), b""]).shape == (0, 2)
+    assert table.needed_bytes == 0
+
+
+def test_a_table_needs_a_message_as_far_as_its_last_signal_goes(dbc_path: Path) -> None:
+    """Not a byte more: a sensor may send less than its DBC says."""
+    dbc, _ = both(dbc_path)
+    for name, message in dbc.messages.items():
+        ends = [signal.last_byte + 1 for signal in message.signals.values()]
+        assert table_of(dbc, name).needed_bytes == max(ends, default=0)
+
+
+def test_a_table_needs_the_multiplexer_that_lets_its_signal_through(tmp_path: Path) -> None:
+    path = tmp_path / "behind.dbc"
+    path.write_text(
+        "BO_ 6 BEHIND: 8 R\n"
+        ' SG_ WHICH M : 56|2@1+ (1,0) [0|0] "" R\n'
+        ' SG_ VALUE m1 : 0|8@1+ (1,0) [0|0] "" R\n'
+    )
+    value = load_dbc(path).messages["BEHIND"].signals["VALUE"]
+    table = SignalTable([Column(value, 1.0, 0.0)])
+    assert table.needed_bytes == 8
+    assert table.decode([bytes([9, 0, 0, 0, 0, 0, 0, 1])]).tolist() == [[9.0]]
+    assert np.isnan(table.decode([bytes([9]), bytes(8)])).all()
