@@ -126,6 +126,17 @@ def test_what_a_short_message_lacks_is_not_known(tmp_path: Path) -> None:
     assert cycle.is_new.tolist() == [False]
 
 
+@pytest.mark.parametrize(("quality", "length_m"), [(3, 4.5), (1, NAN)])
+def test_a_field_counts_only_where_its_condition_holds(
+    tmp_path: Path, quality: int, length_m: float
+) -> None:
+    text = RICH_TOML.replace(
+        'length = "LENGTH"', 'length = { signal = "LENGTH", when = "QUALITY == 3" }'
+    )
+    cycle = decoded(tmp_path, rich(quality=quality), text)
+    np.testing.assert_allclose(cycle.length_m, [length_m])
+
+
 @pytest.mark.parametrize(("key", "velocity"), [("x", [1.0, NAN]), ("y", [NAN, -2.0])])
 def test_a_sensor_may_know_one_part_of_the_velocity(
     tmp_path: Path, key: str, velocity: list[float]
