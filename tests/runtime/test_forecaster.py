@@ -321,13 +321,13 @@ def test_a_run_that_fails_leaves_the_others() -> None:
 
 def test_it_says_how_long_scenes_and_runs_took() -> None:
     """By a clock on which every look takes a second: twice in the beginning, thrice per batch."""
-    looks = itertools.count()
+    looks = itertools.count(100)
     drive = Drive()
     drive.see(standing(BATCH + 1), NOW_S)
     deadline = Deadline(lambda: next(looks), math.inf, math.inf)
     raw = drive.predict(Direct(Steady()), deadline=deadline)
     assert (raw.scene_s, raw.infer_s) == (1.0 + 2.0, 2.0)
-    assert next(looks) == 8
+    assert next(looks) == 108
 
 
 # --- what the model said
@@ -343,6 +343,7 @@ def test_a_model_that_has_not_spoken_is_silent_on_everything() -> None:
     assert np.isnan(raw.probabilities).all()
     assert raw.covariances is None
     assert raw.late.tolist() == [False] * 3
+    assert raw.late.dtype == np.bool_
     uncertain = Raw.silent(targets, replace(CONTRACT, covariances=True)).covariances
     assert uncertain is not None
     assert uncertain.shape == (3, 2, 3, 2, 2)
@@ -373,7 +374,8 @@ def test_no_targets_are_targets_with_every_field_empty() -> None:
     assert nobody.history.shape == (0, CONTRACT.history_steps, 2)
     assert nobody.valid.shape == (0, CONTRACT.history_steps)
     for field in fields(Targets):
-        assert getattr(nobody, field.name).dtype == getattr(some, field.name).dtype, field.name
+        empty, full = getattr(nobody, field.name), getattr(some, field.name)
+        assert (len(empty), empty.dtype) == (0, full.dtype), field.name
 
 
 def test_targets_are_joined_field_by_field() -> None:
