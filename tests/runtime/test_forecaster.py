@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from drives import TILE, Car, object_list
-from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
 from eqrt.core.lane_choice import centerline_source
 from eqrt.core.scene import CenterlineSource, Scene
@@ -25,43 +24,10 @@ from eqrt.runtime.prediction.watched import Direct, TooLate
 from eqrt.runtime.tracking.ego import EgoTracker
 from eqrt.runtime.tracking.tracks import TrackStore
 from raw_predictions import driving
+from steady_model import CONTRACT, DT_S, Steady
 
-DT_S = 0.125  # which a float holds exactly
-CONTRACT = ModelContract(
-    name="steady",
-    version="1.0.0",
-    num_agents=3,
-    history_steps=4,
-    num_centerlines=2,
-    centerline_points=5,
-    horizon_steps=3,
-    num_modes=2,
-    dt_s=DT_S,
-)
 NOW_S = 10.0
 STANDING = Pose2()
-
-
-class Steady:
-    """A model: every target goes on as in its last step. Keeps the scenes that it read."""
-
-    contract = CONTRACT
-    model_id = "steady"
-
-    def __init__(self) -> None:
-        self.scenes: list[Scene] = []
-
-    def predict(self, scene: Scene) -> Prediction:
-        self.scenes.append(scene)
-        last = scene.history[:, 0, -1].astype(np.float64)
-        step = last - scene.history[:, 0, -2]
-        ahead = np.arange(1, CONTRACT.horizon_steps + 1)[:, None]
-        path = scene.origin + last[:, None] + step[:, None] * ahead
-        probabilities = np.tile(np.float32([0.75, 0.25]), (len(path), 1))
-        return Prediction(np.stack([path, path], axis=1), probabilities)
-
-    def again(self) -> Steady:
-        return Steady()
 
 
 class Paced(Direct):

@@ -121,8 +121,7 @@ class Pipeline:
         )
         self._modes = ModeKeeper()
         self._nobody = Raw.silent(Targets.none(predictor.contract), predictor.contract)
-        self._controlled_s = -np.inf
-        self._predicted_s = -np.inf
+        self._controlled_s = self._predicted_s = np.nan  # never
         self._silent_due_s = np.inf
 
     def feed(self, message: can.Message, timestamp_s: float) -> list[ForecastSet]:
@@ -141,7 +140,7 @@ class Pipeline:
         dt_s = self.predictor.contract.dt_s
         if np.isfinite(self._silent_due_s):  # a clock that was set back
             self._silent_due_s = min(self._silent_due_s, now_s + SILENT_PERIODS * dt_s)
-        if now_s >= self._silent_due_s and not made:
+        if now_s >= self._silent_due_s:  # so nothing was made now
             self._silent_due_s = now_s + dt_s - (now_s - self._silent_due_s) % dt_s
             made.append(self._silence(now_s))
         return made
