@@ -197,8 +197,8 @@ class _Worker:
     def retire(self) -> None:
         """Nothing will be asked any more: the thread ends when it can, and lets go of the model."""
         self._scene = None
-        if self._asked.locked():  # else it has been rung for already
-            self._asked.release()
+        self._asked.acquire(blocking=False)  # it may have been rung for, and not heard yet
+        self._asked.release()
 
     def _work(self) -> None:
         while True:
