@@ -38,7 +38,7 @@ class Steady:
         step = np.where(seen, last - scene.history[:, 0, -2], 0.0)
         ahead = np.arange(1, self.contract.horizon_steps + 1)[:, None]
         path = scene.origin + last[:, None] + step[:, None] * ahead
-        probabilities = np.tile(np.float32([0.75, 0.25]), (len(path), 1))
+        probabilities = np.tile(np.array([0.75, 0.25], np.float32), (len(path), 1))
         trajectories = np.stack([path, path], axis=1)
         covariances = np.zeros((*trajectories.shape, 2)) + np.eye(2)
         return Prediction(

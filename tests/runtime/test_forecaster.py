@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drives import TILE, Car, object_list
 from eqrt.core.frames import Pose2
@@ -225,9 +225,9 @@ def in_time(runner: Paced, *, shed_s: float, end_s: float = math.inf) -> Raw:
     return drive.predict(runner, deadline=Deadline(runner.clock, begun_s + shed_s, begun_s + end_s))
 
 
-def batches(flags: NDArray[np.bool_]) -> list[bool]:
+def batches(flags: ArrayLike) -> list[bool]:
     """What is true of whole batches."""
-    parts = [flags[:BATCH], flags[BATCH : 2 * BATCH], flags[2 * BATCH :]]
+    parts = np.split(np.asarray(flags), [BATCH, 2 * BATCH])
     assert all(part.all() == part.any() for part in parts)
     return [bool(part.all()) for part in parts]
 
