@@ -109,6 +109,8 @@ def test_another_origin_of_the_map_begins_the_places_anew(
     assert pipeline.ego.epoch == epoch + 1
     exchanged(pipeline, shipped_predictor(), None)
     assert pipeline.ego.epoch == epoch + 2
+    exchanged(pipeline, shipped_predictor(), tile)
+    assert pipeline.ego.epoch == epoch + 3
 
 
 def test_the_origin_is_that_of_the_tile_from_the_start_and_after_an_exchange(

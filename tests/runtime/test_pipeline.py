@@ -233,12 +233,14 @@ def test_an_unfinished_cycle_is_predicted_when_its_time_is_over() -> None:
     np.testing.assert_array_equal(forecast.object_id, [7, 3])
 
 
-def test_finishing_closes_what_is_open() -> None:
+@pytest.mark.parametrize("end_s", [0.0, 1.0])
+def test_finishing_closes_what_is_open(end_s: float) -> None:
+    """Whether or not other messages came since."""
     pipeline = pipeline_of()
     feed(pipeline, cycle(CARS[:2], 0.0)[:-1])
-    (forecast,) = pipeline.finish(0.0)
+    (forecast,) = pipeline.finish(end_s)
     assert forecast.num_targets == 2
-    assert pipeline.finish(0.0) == []
+    assert pipeline.finish(end_s) == []
 
 
 def test_a_cycle_without_objects_says_that_there_are_none() -> None:
