@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import can
+import cantools.database
 import pytest
 
+import eqrt.runtime.decoding.profile
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
 from eqrt.runtime.decoding.profile import load_profile
-from sbg_ins import sbg_messages
 from tiny_sensor import EGO, GEAR, decoder_of, message
+
+SBG_DBC = Path(eqrt.runtime.decoding.profile.__file__).parent / "dbc" / "sbg" / "sbgCan.dbc"
 
 WHEELS = """
 description = "speed from two wheels, with the gear for its direction"
@@ -83,6 +87,22 @@ def test_a_message_cut_short_tells_what_is_in_it(tmp_path: Path) -> None:
 
 def test_an_empty_message_tells_nothing(tmp_path: Path) -> None:
     assert feed(tmp_path, [(5.0, message(EGO, b""))]) == []
+
+
+def sbg_messages(
+    latitude_deg: float, longitude_deg: float, heading_rad: float
+) -> list[can.Message]:
+    """What the INS sends of a fix that is good to 10 cm, from its published DBC."""
+    database: Any = cantools.database.load_file(SBG_DBC)
+    values = {
+        "SBG_ECAN_MSG_EKF_EULER": {"ROLL": 0, "PITCH": 0, "YAW": heading_rad},
+        "SBG_ECAN_MSG_EKF_POS": {"LATITUDE": latitude_deg, "LONGITUDE": longitude_deg},
+        "SBG_ECAN_MSG_EKF_POS_ACC": dict.fromkeys(
+            ("LATITUDE_ACC", "LONGITUDE_ACC", "ALTITUDE_ACC"), 0.1
+        ),
+    }
+    definitions = [(database.get_message_by_name(name), value) for name, value in values.items()]
+    return [message(d.frame_id, d.encode(value)) for d, value in definitions]
 
 
 def pose_of(decoder: Decoder, messages: list[can.Message]) -> Pose2:

@@ -18,7 +18,7 @@ from eqrt.runtime.pipeline import Pipeline, lanes_for
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import Tile, load_tile, save_tile
 from handmade_model import CONTRACT, write_handmade
-from sbg_ins import sbg_messages
+from tiny_sensor import EGO, message, profile_of
 from two_tiles import CARS, POSE, other_tile
 
 
@@ -82,9 +82,24 @@ def test_poses_in_map_coordinates_do_not_care_where_the_tile_says_its_origin_is(
     assert (after.mode, set(after.agent_mode)) == (Mode.RUN, {Mode.RUN})
 
 
+GEODETIC = """
+description = "poses by latitude and longitude, to a tenth of a degree"
+
+[[ego]]
+bus = "car"
+dbc = "tiny.dbc"
+messages = { pose = "EGO" }
+
+[ego.fields]
+latitude = { signal = "pose.LEFT", unit = "deg" }
+longitude = { signal = "pose.RIGHT", unit = "deg" }
+heading = { signal = "pose.YAW_RATE", unit = "deg" }
+"""
+
+
 @pytest.fixture
 def geodetic(tmp_path: Path) -> Callable[[float, float], Pipeline]:
-    """A pipeline on the built-in INS profile, with the demo's tile at an origin."""
+    """A pipeline whose poses come as latitude and longitude, with the demo's tile at an origin."""
 
     def made(latitude_deg: float, longitude_deg: float) -> Pipeline:
         folder = tmp_path / f"{latitude_deg}-{longitude_deg}"
@@ -92,7 +107,7 @@ def geodetic(tmp_path: Path) -> Callable[[float, float], Pipeline]:
         at = other_tile(
             folder, origin_latitude_deg=latitude_deg, origin_longitude_deg=longitude_deg
         )
-        return Pipeline(load_profile("sbg-ins"), shipped_predictor(), load_tile(at))
+        return Pipeline(profile_of(folder, GEODETIC), shipped_predictor(), load_tile(at))
 
     return made
 
@@ -116,15 +131,15 @@ def test_another_origin_of_the_map_begins_the_places_anew(
 def test_the_origin_is_that_of_the_tile_from_the_start_and_after_an_exchange(
     geodetic: Callable[[float, float], Pipeline],
 ) -> None:
-    """Half a degree further east at 48 degrees north, and back."""
+    """48 degrees north, 11.5 east: half a degree from the first one, none from the second."""
+    here = message(EGO, (480).to_bytes(2, "little") + (115).to_bytes(2, "little") + bytes(4))
     pipeline = geodetic(48.0, 11.0)
     east_m = []
     for step, tile in enumerate([None, geodetic(48.0, 11.5).tile, geodetic(48.0, 11.25).tile]):
         if tile is not None:
             exchanged(pipeline, shipped_predictor(), tile)
         for now_s in (step, step + 0.1):
-            for message in sbg_messages(48.0, 11.5, heading_rad=0.0):
-                pipeline.feed(message, now_s)
+            pipeline.feed(here, now_s)
         place = pipeline.ego.map_from_ego(step + 0.1)
         assert place is not None
         east_m.append(place.x_m)
