@@ -418,6 +418,7 @@ def test_a_cycle_that_waited_too_long_is_not_given_to_the_model() -> None:
     assert (forecast.mode, model.runs) == (Mode.LATE, 0)
     (forecast,) = pipeline_fed(pipeline, cycle(CARS, 0.1), 0.1)  # 20 ms early
     assert (forecast.agent_mode == Mode.PARTIAL).all()
+    assert (pipeline.counters.shed, pipeline.counters.targets) == (3, 6)
 
 
 def pipeline_fed(
