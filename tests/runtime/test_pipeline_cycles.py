@@ -194,13 +194,13 @@ class Ticking:
 
 
 def test_it_says_how_long_each_stage_took(profile: Profile) -> None:
-    """One look per stage and end of a stage, and one of the watched model's."""
+    """One look per beginning and end of a stage."""
     road = Road(profile, Steady(SLOW_CLOCK), Ticking(7.0))
     forecast = road.predict(5, 6, at_s=6.9375)
     assert road.pipeline.times == StageTimes(
-        tracks_s=1 / 64, scene_s=2 / 64, infer_s=2 / 64, guard_s=1 / 64
+        tracks_s=1 / 64, scene_s=2 / 64, infer_s=1 / 64, guard_s=1 / 64
     )
-    assert (forecast.made_s, forecast.compute_s) == (7.0 + 9 / 64, 9 / 64)
+    assert (forecast.made_s, forecast.compute_s) == (7.0 + 8 / 64, 8 / 64)
     assert forecast.timestamp_s == 6.9375
 
 
