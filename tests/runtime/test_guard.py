@@ -11,39 +11,9 @@ from eqrt.core.kinematics import constant_turn
 from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.prediction.forecaster import Raw
 from eqrt.runtime.prediction.guard import LIMITS, MAX_GAIN_MPS, START_M, Guarded, guard
-from eqrt.runtime.prediction.targets import Targets
-
-DT_S = 0.1
-STEPS = 30
-AHEAD_S = DT_S * np.arange(1, STEPS + 1)
+from raw_predictions import AHEAD_S, DT_S, STEPS, driving
 
 Float64 = NDArray[np.float64]
-
-
-def driving(
-    speed_mps: float = 12.0, kind: int = ObjectClass.CAR, targets: int = 1, modes: int = 2
-) -> Raw:
-    """Targets that drive along +x and are at (0, 0) now; every mode goes on like that."""
-    history = np.stack([speed_mps * DT_S * np.arange(-19, 1), np.zeros(20)], axis=-1)
-    ahead = np.stack([speed_mps * AHEAD_S, np.zeros(STEPS)], axis=-1)
-    unknown = np.full(targets, np.nan)
-    return Raw(
-        targets=Targets(
-            track_id=np.arange(targets),
-            object_id=np.arange(targets),
-            anchor_s=np.zeros(targets),
-            heading_rad=unknown,
-            object_class=np.full(targets, kind, np.uint8),
-            length_m=unknown,
-            width_m=unknown,
-            history=np.tile(history, (targets, 1, 1)),
-            valid=np.ones((targets, 20), np.bool_),
-        ),
-        trajectories=np.tile(ahead, (targets, modes, 1, 1)),
-        probabilities=np.full((targets, modes), 1.0 / modes),
-        covariances=None,
-        late=np.zeros(targets, np.bool_),
-    )
 
 
 def guarded(raw: Raw) -> Guarded:
@@ -73,6 +43,13 @@ def test_a_possible_prediction_passes_untouched() -> None:
     np.testing.assert_allclose(result.velocity, [[12.0, 0.0]])
 
 
+def test_a_mode_may_have_no_probability_at_all() -> None:
+    """A softmax in float32 gives 0 to what it thinks impossible."""
+    raw = driving(modes=3)
+    raw.probabilities[:] = [1.0, 0.0, 0.0]
+    assert guarded(raw).accepted.all()
+
+
 def nan_in_a_late_mode(raw: Raw) -> None:
     raw.trajectories[0, 1, 20] = np.nan
 
@@ -93,6 +70,11 @@ def probabilities_that_do_not_sum_to_one(raw: Raw) -> None:
     raw.probabilities *= 1.1
 
 
+def a_negative_probability(raw: Raw) -> None:
+    """They still sum to one."""
+    raw.probabilities[0] = [1.5, -0.5]
+
+
 def an_infinite_probability(raw: Raw) -> None:
     raw.probabilities[0, 0] = np.inf
 
@@ -110,6 +92,7 @@ def a_covariance_that_is_none(raw: Raw) -> None:
         teleport,
         braking_that_no_tyre_gives,
         probabilities_that_do_not_sum_to_one,
+        a_negative_probability,
         an_infinite_probability,
         a_covariance_that_is_none,
     ],

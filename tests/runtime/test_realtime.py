@@ -47,7 +47,16 @@ def without_rights() -> list[str]:
 def refused(*more: str) -> subprocess.CompletedProcess[str]:
     """`eqrt serve` without rights, ended after ten seconds if it does not end by itself."""
     return subprocess.run(
-        ["timeout", "--signal=TERM", "10", *without_rights(), *EQRT, "serve", *options(*more)],
+        [
+            "timeout",
+            "--foreground",
+            "--signal=TERM",
+            "10",
+            *without_rights(),
+            *EQRT,
+            "serve",
+            *options(*more),
+        ],
         capture_output=True,
         text=True,
         check=False,

@@ -8,136 +8,23 @@ import re
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import can
-import numpy as np
-import pytest
 
-from drives import TILE, Car, cycle, shipped_predictor, traffic
-from eqrt.core.frames import Pose2
-from eqrt.core.tile import encode
+from drives import TILE, cycle
 from eqrt.runtime.bus.buses import LOCAL, open_bus
-from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
-from eqrt.runtime.pipeline import Pipeline, lanes_for
-from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
-from eqrt.runtime.prediction.tiles import Tile, load_tile, save_tile
+from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from handmade_model import CONTRACT, write_handmade
 from processes import PATIENCE_S, Heard, Serving
+from two_tiles import CARS, POSE, other_tile
 
-CARS = [Car(object_id=1, x_m=0.0, y_m=0.0), Car(object_id=2, x_m=20.0, y_m=4.0)]
 SLOW = [replace(car, speed_mps=0.5) for car in CARS]
 """They stay where there are lanes for as long as a test takes."""
-X_M, Y_M = load_tile(TILE).lane_map.points[0].tolist()
-POSE = Pose2(X_M, Y_M, 0.0)
-"""Where there are lanes."""
-
-
-def other_tile(folder: Path, **info: object) -> Path:
-    """The demo's tile under another name, so with another id."""
-    tile = load_tile(TILE)
-    path = folder / "other.tile"
-    save_tile(path, encode(tile.lane_map, replace(tile.info, name="other", **info)))  # type: ignore[arg-type]  # its own fields
-    return path
-
-
-def said(pipeline: Pipeline, messages: Iterator[can.Message]) -> list[ForecastSet]:
-    return [made for m in messages for made in pipeline.feed(m, m.timestamp)]
-
-
-def exchanged(pipeline: Pipeline, predictor: Predictor, tile: Tile | None) -> None:
-    pipeline.exchange(predictor, tile, lanes_for(tile, predictor))
-
-
-# --- in the pipeline
-
-
-def test_an_exchange_keeps_tracks_and_histories(tmp_path: Path) -> None:
-    """A model of other sizes and another tile, in the middle of a drive: not one cycle is worse."""
-    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(TILE))
-    before = said(pipeline, traffic(CARS, 3.0, pose=POSE))
-    handmade = Predictor.load(write_handmade(tmp_path / "model"))
-    exchanged(pipeline, handmade, load_tile(other_tile(tmp_path)))
-    (after,) = said(pipeline, iter(cycle(CARS, 3.1, pose=POSE)))
-    assert after.cycle == before[-1].cycle + 1
-    assert (before[-1].mode, after.mode) == (Mode.RUN, Mode.RUN)
-    assert set(after.agent_mode) == {Mode.RUN}
-    assert after.track_id.tolist() == before[-1].track_id.tolist()
-    assert after.model_id == handmade.model_id != before[-1].model_id
-    assert after.tile_id == load_tile(tmp_path / "other.tile").info.tile_id != before[-1].tile_id
-    assert after.trajectories.shape == (2, CONTRACT.num_modes, CONTRACT.horizon_steps, 2)
-    assert after.history.shape[1] == CONTRACT.history_steps
-    ahead = after.trajectories[:, 0, -1] - after.position
-    np.testing.assert_allclose(np.linalg.norm(ahead, axis=-1), 10.0, atol=0.2)  # 1 s at 10 m/s
-    (nobody,) = said(pipeline, iter(cycle([], 9.0, pose=POSE)))
-    assert nobody.trajectories.shape == (0, CONTRACT.num_modes, CONTRACT.horizon_steps, 2)
-
-
-def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:
-    """Without lanes near the cars, the model predicts what it predicts without a map."""
-    tile = load_tile(TILE)
-    far = replace(tile.lane_map, points=tile.lane_map.points + np.float32(5e4))
-    path = tmp_path / "far.tile"
-    save_tile(path, encode(far, tile.info))
-    ends = []
-    for first, then in ((TILE, None), (TILE, path), (path, None), (path, TILE)):
-        pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(first))
-        said(pipeline, traffic(CARS, 3.0, pose=POSE))
-        if then:
-            exchanged(pipeline, shipped_predictor(), load_tile(then))
-        (after,) = said(pipeline, iter(cycle(CARS, 3.1, pose=POSE)))
-        ends.append(after.trajectories)
-    assert not np.allclose(ends[0], ends[1], atol=1e-3)
-    np.testing.assert_allclose(ends[1], ends[2], atol=1e-9)
-    np.testing.assert_allclose(ends[0], ends[3], atol=1e-9)
-
-
-def test_poses_in_map_coordinates_do_not_care_where_the_tile_says_its_origin_is(
-    tmp_path: Path,
-) -> None:
-    """They come as x and y: the map frame is that of whoever sends them."""
-    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(TILE))
-    said(pipeline, traffic(CARS, 3.0, pose=POSE))
-    elsewhere = other_tile(tmp_path, origin_latitude_deg=1.0, origin_longitude_deg=2.0)
-    exchanged(pipeline, shipped_predictor(), load_tile(elsewhere))
-    (after,) = said(pipeline, iter(cycle(CARS, 3.1, pose=POSE)))
-    assert (after.mode, set(after.agent_mode)) == (Mode.RUN, {Mode.RUN})
-
-
-@pytest.fixture
-def geodetic(tmp_path: Path) -> Callable[[float, float], Pipeline]:
-    """A pipeline on the built-in INS profile, with the demo's tile at an origin."""
-
-    def made(latitude_deg: float, longitude_deg: float) -> Pipeline:
-        folder = tmp_path / f"{latitude_deg}-{longitude_deg}"
-        folder.mkdir()
-        at = other_tile(
-            folder, origin_latitude_deg=latitude_deg, origin_longitude_deg=longitude_deg
-        )
-        return Pipeline(load_profile("sbg-ins"), shipped_predictor(), load_tile(at))
-
-    return made
-
-
-def test_another_origin_of_the_map_begins_the_places_anew(
-    geodetic: Callable[[float, float], Pipeline],
-) -> None:
-    """Of poses by latitude and longitude; the same origin changes nothing."""
-    pipeline = geodetic(48.0, 11.0)
-    epoch, tile = pipeline.ego.epoch, pipeline.tile
-    exchanged(pipeline, shipped_predictor(), tile)
-    assert pipeline.ego.epoch == epoch
-    exchanged(pipeline, shipped_predictor(), geodetic(48.0, 11.5).tile)
-    assert pipeline.ego.epoch == epoch + 1
-    exchanged(pipeline, shipped_predictor(), None)
-    assert pipeline.ego.epoch == epoch + 2
-
-
-# --- in a process
 
 
 class Driving:

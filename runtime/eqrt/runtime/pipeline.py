@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import can
 import numpy as np
-from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
 from eqrt.core.lane_choice import centerline_source
@@ -24,7 +23,7 @@ from eqrt.runtime.decoding.profile import Profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.prediction.forecaster import Deadline, Forecaster, Raw
 from eqrt.runtime.prediction.guard import Guarded, guard
-from eqrt.runtime.prediction.modes import ModeKeeper
+from eqrt.runtime.prediction.modes import ModeKeeper, agent_modes, cycle_reasons
 from eqrt.runtime.prediction.targets import Targets
 from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.prediction.watched import Direct, Model, Runner, Watched
@@ -122,8 +121,7 @@ class Pipeline:
         )
         self._modes = ModeKeeper()
         self._nobody = Raw.silent(Targets.none(predictor.contract), predictor.contract)
-        self._controlled_s = -np.inf
-        self._predicted_s = -np.inf
+        self._controlled_s = self._predicted_s = np.nan  # never
         self._silent_due_s = np.inf
 
     def feed(self, message: can.Message, timestamp_s: float) -> list[ForecastSet]:
@@ -142,7 +140,7 @@ class Pipeline:
         dt_s = self.predictor.contract.dt_s
         if np.isfinite(self._silent_due_s):  # a clock that was set back
             self._silent_due_s = min(self._silent_due_s, now_s + SILENT_PERIODS * dt_s)
-        if now_s >= self._silent_due_s and not made:
+        if now_s >= self._silent_due_s:  # so nothing was made now
             self._silent_due_s = now_s + dt_s - (now_s - self._silent_due_s) % dt_s
             made.append(self._silence(now_s))
         return made
@@ -229,10 +227,10 @@ class Pipeline:
         made_s = self._time(moment.now_s)
         self.times.guard_s = made_s - begun_s
         self._count(raw, guarded)
-        late = made_s - moment.now_s > dt_s or bool(raw.late.any())
         mode = Mode.SILENT
         if not silent:
-            reasons = self._reasons(raw, guarded, ego, late)
+            overdue, has_tile = made_s - moment.now_s > dt_s, self.tile is not None
+            reasons = cycle_reasons(raw, guarded, ego, has_tile=has_tile, overdue=overdue)
             mode = self._modes.cycle(reasons, moment.now_s)
         used_tile = self.tile if raw.has_lanes else None
         return ForecastSet(
@@ -249,7 +247,7 @@ class Pipeline:
             track_id=targets.track_id,
             object_id=targets.object_id,
             anchor_s=targets.anchor_s,
-            agent_mode=_agent_modes(raw, guarded),
+            agent_mode=agent_modes(raw, guarded),
             position=targets.history[:, -1],
             velocity=guarded.velocity,
             heading_rad=targets.heading_rad,
@@ -273,17 +271,6 @@ class Pipeline:
         counters.model_overruns = self._runner.overruns
         counters.model_restarts = self._runner.restarts
 
-    def _reasons(self, raw: Raw, guarded: Guarded, ego: EgoState | None, late: bool) -> set[Mode]:
-        """All that is wrong with a cycle."""
-        refused = ~guarded.accepted & ~raw.late
-        found = {
-            Mode.FALLBACK: refused.any() and not guarded.accepted.any(),
-            Mode.NO_POSE: ego is None or (self.tile is not None and not ego.has_map_pose),
-            Mode.LATE: late,
-            Mode.NO_MAP: self.tile is None or (guarded.accepted.any() and not raw.has_lanes),
-        }
-        return {mode for mode, holds in found.items() if holds}
-
     def _silence(self, now_s: float) -> ForecastSet:
         moment = _Moment(self._predicted_s, now_s, now_s)
         return self._forecast(self._nobody, None, moment, silent=True)
@@ -302,13 +289,6 @@ class _Moment:
     """The message that completed the cycle arrived."""
     started_s: float
     """Work on it began."""
-
-
-def _agent_modes(raw: Raw, guarded: Guarded) -> NDArray[np.uint8]:
-    """(B,) how each target was predicted."""
-    seen = np.where(raw.targets.valid.all(axis=1), Mode.RUN, Mode.PARTIAL)
-    fell_back = np.where(raw.late, Mode.LATE, Mode.FALLBACK)
-    return np.where(guarded.accepted, seen, fell_back).astype(np.uint8)
 
 
 def lanes_for(tile: Tile | None, predictor: Model) -> CenterlineSource | None:

@@ -32,7 +32,10 @@ and lanes anew; a smaller one would leave less undone when time runs out.
 
 @dataclass(slots=True)
 class Raw:
-    """What the model said, before the guard. Arrays share the axis B, nearest target first."""
+    """What the model said, before the guard.
+
+    Arrays share the axis B: the nearest BATCH targets first, in a batch by time of measurement.
+    """
 
     targets: Targets
     trajectories: Float64
@@ -148,7 +151,7 @@ class Forecaster:
         """All tracks, and the ego vehicle after them, on the clock that ends at `anchor_s`."""
         steps, dt_s = self._contract.history_steps, self._contract.dt_s
         positions, valid = self._tracks.history(anchor_s, steps, dt_s, tracks.row)
-        facing = np.stack([np.cos(tracks.heading_rad), np.sin(tracks.heading_rad)], axis=-1)
+        facing = np.stack([np.cos(tracks.heading_rad), np.sin(tracks.heading_rad)], axis=1)
         heading = np.where(np.isfinite(facing), facing, 0.0)
         past = [self._ego.map_from_ego(anchor_s - k * dt_s) for k in range(steps - 1, -1, -1)]
         own = [(np.nan, np.nan) if pose is None else (pose.x_m, pose.y_m) for pose in past]

@@ -115,8 +115,9 @@ def guard(
 
 
 def _finite(trajectories: Float64, probabilities: Float64, covariances: Float64 | None) -> Bool:
-    """(B,) numbers, probabilities that sum to one."""
+    """(B,) numbers, probabilities that are none below zero and sum to one."""
     finite = np.isfinite(trajectories).all(axis=(1, 2, 3))
+    finite &= (probabilities >= 0.0).all(axis=1)
     finite &= np.abs(probabilities.sum(axis=1) - 1.0) <= _SUM_TOLERANCE  # no for NaN and infinity
     if covariances is not None:
         finite &= np.isfinite(covariances).all(axis=(1, 2, 3, 4))
@@ -131,7 +132,7 @@ def _possible(
     step = np.diff(path, axis=2) / dt_s  # (B, K, H - 1, 2) m/s
     rows = _TABLE[np.minimum(known, len(_TABLE) - 1)]
     max_speed, *others = rows.T[..., None, None]  # (B, 1, 1) each
-    measured = np.linalg.norm(velocity, axis=-1)[:, None, None]
+    measured = np.linalg.norm(velocity, axis=1)[:, None, None]
     max_speed = np.maximum(max_speed, np.minimum(measured + MAX_GAIN_MPS, MAX_SPEED_MPS))
     within = (np.linalg.norm(step, axis=-1) <= max_speed).all(axis=-1)
     within &= (first_m <= START_M) & _turns_possibly(step, dt_s, *others)
@@ -145,8 +146,8 @@ def _turns_possibly(
     window = min(WINDOW_STEPS, step.shape[2] - 1)
     before, after = step[:, :, :-window], step[:, :, window:]
     change = (after - before) / (window * dt_s)
-    mean = 0.5 * (before + after)
-    direction = mean / np.maximum(np.linalg.norm(mean, axis=-1), 1e-6)[..., None]
+    total = before + after
+    direction = total / np.maximum(np.linalg.norm(total, axis=-1), 1e-6)[..., None]
     speed = 0.5 * (np.linalg.norm(before, axis=-1) + np.linalg.norm(after, axis=-1))
     forward = np.abs((change * direction).sum(axis=-1))
     sideways = np.abs(change[..., 0] * direction[..., 1] - change[..., 1] * direction[..., 0])

@@ -11,6 +11,7 @@ import contextlib
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 from eqrt.core.contract import ModelContract
@@ -95,13 +96,16 @@ class Direct:
 
 
 class Watched:
-    """Runs a model in a thread, and stops waiting when its time is over."""
+    """Runs a model in a thread, and stops waiting when its time is over.
 
-    def __init__(self, model: Model) -> None:
+    By `clock` a model is stuck, or is due for another attempt to load it.
+    """
+
+    def __init__(self, model: Model, clock: Callable[[], float] = time.monotonic) -> None:
         self.errors = self.overruns = self.restarts = 0  # as of Direct
         self._model = model
+        self._clock = clock
         self._worker = _Worker(model)
-        self._begun_s = -math.inf
         self._errors_in_a_row = 0
         self._pause_s = STUCK_S
         self._next_restart_s = -math.inf
@@ -113,11 +117,11 @@ class Watched:
         Raises TooLate if that is over before, Failed if the model raises or is still at work on an
         earlier scene.
         """
-        self._replace_if_broken()
-        if self._worker.is_busy():
+        now_s = self._clock()
+        self._replace_if_broken(now_s)
+        if self._worker.busy_since_s() is not None:
             raise Failed("the model is still at work on an earlier scene")
-        self._begun_s = time.monotonic()
-        answer = self._worker.ask(scene, patience_s)
+        answer = self._worker.ask(scene, patience_s, now_s)
         if answer is None:
             self.overruns += 1
             raise TooLate(f"no answer within {patience_s:.3f} s")
@@ -131,19 +135,20 @@ class Watched:
     def succeeded_by(self, model: Model) -> Watched:
         """One for another model, which counts on; this one and its thread come to an end."""
         self._worker.retire()
-        return _counting_on(self, Watched(model))
+        return _counting_on(self, Watched(model, self._clock))
 
-    def _replace_if_broken(self) -> None:
+    def _replace_if_broken(self, now_s: float) -> None:
         """Have the model loaded anew, beside the loop; take it when it is there."""
-        now_s = time.monotonic()
         if self._successor is not None:
             if self._successor.is_loading():
                 return
             if self._successor.model is not None:
+                self._worker.retire()
                 self._worker, self._errors_in_a_row = _Worker(self._successor.model), 0
                 self.restarts += 1
             self._successor = None
-        is_stuck = self._worker.is_busy() and now_s - self._begun_s > STUCK_S
+        since_s = self._worker.busy_since_s()
+        is_stuck = since_s is not None and now_s - since_s > STUCK_S
         if (is_stuck or self._errors_in_a_row >= MAX_ERRORS) and now_s >= self._next_restart_s:
             self._next_restart_s = now_s + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
@@ -169,31 +174,31 @@ class _Worker:
         self._asked, self._answered = threading.Lock(), threading.Lock()
         self._asked.acquire()
         self._answered.acquire()
-        self._scene: Scene | None = None
-        self._answer: Prediction | Exception | None = None
-        self._busy = False
+        self._scene: Scene | None  # to be worked on; None = no more
+        self._answer: Prediction | Exception
+        self._begun_s: float | None = None
         threading.Thread(target=self._work, name="model", daemon=True).start()
 
-    def is_busy(self) -> bool:
-        """Still at work on something that nobody waits for any more."""
-        if self._busy and self._answered.acquire(blocking=False):
-            self._busy = False
-        return self._busy
+    def busy_since_s(self) -> float | None:
+        """Since when it is at work on something that nobody waits for any more; None = idle."""
+        if self._begun_s is not None and self._answered.acquire(blocking=False):
+            self._begun_s = None
+        return self._begun_s
 
-    def ask(self, scene: Scene, patience_s: float) -> Prediction | Exception | None:
+    def ask(self, scene: Scene, patience_s: float, now_s: float) -> Prediction | Exception | None:
         """What the model says or raises; None = nothing yet."""
-        self._scene, self._busy = scene, True
+        self._scene, self._begun_s = scene, now_s
         self._asked.release()
         if not self._answered.acquire(timeout=max(patience_s, 0.0)):
             return None
-        self._busy = False
+        self._begun_s = None
         return self._answer
 
     def retire(self) -> None:
-        """Nothing will be asked any more: the thread ends as soon as it can."""
+        """Nothing will be asked any more: the thread ends when it can, and lets go of the model."""
         self._scene = None
-        if self._asked.locked():  # else it has been rung for already
-            self._asked.release()
+        self._asked.acquire(blocking=False)  # it may have been rung for, and not heard yet
+        self._asked.release()
 
     def _work(self) -> None:
         while True:
@@ -213,7 +218,9 @@ class _Successor:
 
     def __init__(self, model: Model) -> None:
         self.model: Model | None = None
-        self._thread = threading.Thread(target=self._load, args=[model], daemon=True)
+        self._thread = threading.Thread(
+            target=self._load, args=[model], name="model loader", daemon=True
+        )
         self._thread.start()
 
     def _load(self, model: Model) -> None:
