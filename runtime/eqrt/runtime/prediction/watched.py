@@ -218,17 +218,18 @@ class _Successor:
 
     def __init__(self, model: Model) -> None:
         self.model: Model | None = None
-        self._thread = threading.Thread(
-            target=self._load, args=[model], name="model loader", daemon=True
-        )
-        self._thread.start()
+        self._is_loading = True
+        threading.Thread(target=self._load, args=[model], name="model loader", daemon=True).start()
 
     def _load(self, model: Model) -> None:
         stand_back()
-        with contextlib.suppress(EqrtError, OSError):  # damaged: tried again after a pause
-            loaded = model.again()
-            if loaded.model_id == model.model_id:  # another one is for `Pipeline.exchange`
-                self.model = loaded
+        try:
+            with contextlib.suppress(EqrtError, OSError):  # damaged: tried again after a pause
+                loaded = model.again()
+                if loaded.model_id == model.model_id:  # another one is for `Pipeline.exchange`
+                    self.model = loaded
+        finally:
+            self._is_loading = False
 
     def is_loading(self) -> bool:
-        return self._thread.is_alive()
+        return self._is_loading
