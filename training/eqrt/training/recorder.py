@@ -16,6 +16,7 @@ from eqrt.training.meter import LossMeter, Stopwatch
 from eqrt.training.plots import plot_metrics
 from eqrt.training.progress import Display, MetricsLog
 from eqrt.training.ranks import Ranks
+from eqrt.training.start import Start, credited
 from eqrt.training.state import TrainingState, save_state
 from eqrt.training.training_data import TrainingData
 
@@ -26,13 +27,20 @@ METRICS_FILE = "metrics.jsonl"
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What is trained, on what, and where it goes."""
+    """What is trained, on what, from what, and where it goes."""
 
     config: TrainConfig
     data: TrainingData
     out: Path
     command: str
     """As typed, for the model card."""
+    start: Start | None = None
+    """None = random weights."""
+
+    def fingerprint(self) -> dict[str, int]:
+        """Tells trainings of one configuration apart by what went in."""
+        start = {} if self.start is None else self.start.fingerprint()
+        return self.data.pool.fingerprint() | start
 
 
 class Recorder:
@@ -81,8 +89,7 @@ class Recorder:
         self._meter.settle(self._state)
         if self._ranks.leads:
             goal = self._goal
-            fingerprint = goal.data.pool.fingerprint()
-            save_state(goal.out / STATE_FILE, self._state, goal.config, fingerprint)
+            save_state(goal.out / STATE_FILE, self._state, goal.config, goal.fingerprint())
 
     def plot(self) -> None:
         """Draw the metrics so far."""
@@ -124,11 +131,12 @@ class Recorder:
 
     def _card(self, metrics: dict[str, float]) -> Card:
         config, data = self._goal.config, self._goal.data
+        source = credited(data.source, self._goal.start)
         return Card(
             name=config.name,
-            data=data.source.credits,
-            license=data.source.license,
-            non_commercial=data.source.non_commercial,
+            data=source.credits,
+            license=source.license,
+            non_commercial=source.non_commercial,
             metrics=metrics,
             baseline=self._baseline,
             command=self._goal.command,

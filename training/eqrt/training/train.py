@@ -33,6 +33,7 @@ from eqrt.training.progress import Display, Lines, Silence, new_display
 from eqrt.training.ranks import Ranks, alone, join_ranks
 from eqrt.training.recorder import MODEL_FILE, STATE_FILE, Goal, Recorder
 from eqrt.training.sampling import DROPOUT, Sampler, derived_seed
+from eqrt.training.start import Start, credited, open_start
 from eqrt.training.state import TrainingState, load_state, new_state, update_average
 from eqrt.training.stopping import StopRequest
 from eqrt.training.training_data import TrainingData, open_training_data
@@ -54,6 +55,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of `eqrt prepare`, or a dataset as it is; may be given several times",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoint and metrics")
+    parser.add_argument(
+        "--from",
+        type=Path,
+        dest="start",
+        metavar="CHECKPOINT",
+        help="begin with the weights of this checkpoint, instead of random ones",
+    )
     parser.add_argument(
         "--resume", action="store_true", help="go on from the state in --out, if there is one"
     )
@@ -83,14 +91,16 @@ def run(args: argparse.Namespace) -> int:
         )
     with join_ranks(args.device) as ranks:
         data = open_training_data(config, args.data)
+        start = None if args.start is None else open_start(args.start, config)
         steps = config.train.total_steps(data.pool.samples_per_epoch)
         shown = new_display(steps) if ranks.leads else Silence()
         with shown as display, StopRequest() as stop:
-            _introduce(config, data, ranks, display)
+            _introduce(config, data, start, ranks, display)
             state = train(
                 config,
                 data,
                 args.out,
+                start=start,
                 ranks=ranks,
                 resume=args.resume,
                 loader_threads=args.loader_threads,
@@ -111,6 +121,7 @@ def train(
     data: TrainingData,
     out: Path,
     *,
+    start: Start | None = None,
     ranks: Ranks | None = None,
     resume: bool = False,
     loader_threads: int = 1,
@@ -120,18 +131,21 @@ def train(
 ) -> TrainingState:
     """The loop. `out` receives the checkpoint, the state, the metrics and their plots.
 
-    The state returned has done all its steps, or fewer if `should_stop` said so. With `resume`, the
-    training goes on from the state in `out` if there is one. Raises EqrtError if that state is of
-    another training, or if the loss is no longer a number.
+    It begins with the weights of `start`, or with random ones. The state returned has done all its
+    steps, or fewer if `should_stop` said so. With `resume`, the training goes on from the state in
+    `out` if there is one. Raises EqrtError if that state is of another training, or if the loss is
+    no longer a number.
     """
     loop, ranks, display = config.train, ranks or alone(), display or Lines()
     make = batch_maker(config, data, ranks)
     steps = loop.total_steps(data.pool.samples_per_epoch)
     state = new_state(config, ranks.device)
+    goal = Goal(config, data, out, command, start)
     if resume and (out / STATE_FILE).exists():
-        load_state(out / STATE_FILE, state, config, data.pool.fingerprint())
+        load_state(out / STATE_FILE, state, config, goal.fingerprint())
         display.line(f"resumed             after step {state.step} of {steps}")
-    goal = Goal(config, data, out, command)
+    elif start is not None:
+        start.begin(state)
     model = ranks.parallel(state.network)
     with (
         closing(Recorder(goal, state, ranks=ranks, display=display)) as recorder,
@@ -224,11 +238,16 @@ def _config(args: argparse.Namespace) -> TrainConfig:
     return config.with_steps(args.steps) if args.steps else config
 
 
-def _introduce(config: TrainConfig, data: TrainingData, ranks: Ranks, display: Display) -> None:
-    """What is trained, on what, and whether one may sell the result."""
+def _introduce(
+    config: TrainConfig, data: TrainingData, start: Start | None, ranks: Ranks, display: Display
+) -> None:
+    """What is trained, on what, from what, and whether one may sell the result."""
     display.line(f"training windows    {len(data.pool)}, {data.pool.samples_per_epoch} an epoch")
     display.line(f"held-out targets    {len(data.held_out)}")
-    display.line(license_notice(data.source) or f"data licence        {data.source.license}")
+    if start is not None:
+        display.line(f"begins with         {start.path}")
+    source = credited(data.source, start)
+    display.line(license_notice(source) or f"data licence        {source.license}")
     if ranks.world > 1:
         share = config.train.batch_size // ranks.world
         display.line(f"processes           {ranks.world}, {share} windows of every batch each")
@@ -239,6 +258,7 @@ def _command(args: argparse.Namespace, resume: bool = False) -> str:
     words = ["eqrt", "train", "--config", args.config]
     words += [word for path in args.data for word in ("--data", path)]
     words += ["--out", args.out]
+    words += [] if args.start is None else ["--from", args.start]
     words += ["--steps", args.steps] if args.steps else []
     words += [] if args.train_share is None else ["--train-share", args.train_share]
     for option in ("threads", "loader_threads"):
