@@ -33,11 +33,13 @@ def main() -> None:
     """Measure each setting, without and with the hogs; a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="for each row (default: 60)")
-    parser.add_argument("--hogs", type=int, default=3, help="programs beside it (default: 3)")
+    parser.add_argument(
+        "--hogs", type=int, nargs="+", default=[0, 3], help="programs beside it (default: 0 3)"
+    )
     args = parser.parse_args()
     print("| hogs | settings | cycles | p50 ms | p99 | p99.9 | max | over 100 ms | shed |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for hogs in (0, args.hogs):
+    for hogs in args.hogs:
         for name, options in SETTINGS.items():
             with eating(hogs):
                 print(f"| {hogs} | {name} | {row(options, args.seconds)} |", flush=True)

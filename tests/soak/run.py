@@ -5,7 +5,7 @@
 
 Simulated: the pipeline, its encoders and its status on a virtual clock, as fast as the machine can.
 Real: `eqrt serve` beside a process that sends ten object lists a second. Memory is resident size
-(RSS); its slope is fitted from an eighth of the time on, when pools have filled.
+(RSS); its slope is fitted over the second half of the time, when pools have filled.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from processes import Serving
 PERIOD_S = 0.1
 DAY_S = 86_400.0
 MIB = 1 << 20
-WARM_UP = 0.125  # of the time
+WARM_UP = 0.5  # of the time
 
 
 @dataclass
