@@ -26,6 +26,7 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import Pipeline, StageTimes
 from eqrt.runtime.prediction.predictor import Prediction
 from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.prediction.watched import Direct, Model, Runner
 from steady_model import CONTRACT, DT_S, Steady
 from tiny_sensor import COUNTED, first, header, profile_of
 
@@ -48,8 +49,9 @@ class Road:
         profile: Profile,
         model: Steady | None = None,
         clock: Callable[[], float] | None = None,
+        run_by: Callable[[Model], Runner] | None = None,
     ) -> None:
-        self.pipeline = Pipeline(profile, model or Steady(), clock=clock)
+        self.pipeline = Pipeline(profile, model or Steady(), clock=clock, run_by=run_by)
         self._counter = itertools.count()
 
     def see(self, *ids: int, at_s: float, age_ms: int = 0) -> ForecastSet | None:
@@ -114,6 +116,28 @@ def test_an_object_is_a_target_until_three_tenths_of_a_second_after_it_was_seen(
         road = Road(profile)
         road.predict(1, at_s=0.0)
         assert sorted(road.predict(2, at_s=at_s).object_id.tolist()) == targets
+
+
+@pytest.mark.parametrize("clock", [None, lambda: 0.0])
+def test_the_model_is_run_by_what_the_pipeline_is_told(
+    profile: Profile, clock: Callable[[], float] | None
+) -> None:
+    made: list[Direct] = []
+
+    class Chosen(Direct):
+        def __init__(self, model: Model) -> None:
+            super().__init__(model)
+            made.append(self)
+            self.runs = 0
+
+        def run(self, scene: Scene, patience_s: float) -> Prediction:
+            self.runs += 1
+            return super().run(scene, patience_s)
+
+    model = Steady()
+    road = Road(profile, model, clock, run_by=Chosen)
+    road.predict(5, at_s=0.0)
+    assert [one.runs for one in made] == [len(model.scenes)] == [1]
 
 
 def test_an_object_is_a_neighbour_for_longer(profile: Profile) -> None:
