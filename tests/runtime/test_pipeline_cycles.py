@@ -76,6 +76,16 @@ class Road:
         return [forecast.made_s for forecast in said]
 
 
+class Counting(Direct):
+    """Counts its runs."""
+
+    runs = 0
+
+    def run(self, scene: Scene, patience_s: float) -> Prediction:
+        self.runs += 1
+        return super().run(scene, patience_s)
+
+
 # --- which cycles are predicted
 
 
@@ -122,20 +132,14 @@ def test_an_object_is_a_target_until_three_tenths_of_a_second_after_it_was_seen(
 def test_the_model_is_run_by_what_the_pipeline_is_told(
     profile: Profile, clock: Callable[[], float] | None
 ) -> None:
-    made: list[Direct] = []
+    made: list[Counting] = []
 
-    class Chosen(Direct):
-        def __init__(self, model: Model) -> None:
-            super().__init__(model)
-            made.append(self)
-            self.runs = 0
-
-        def run(self, scene: Scene, patience_s: float) -> Prediction:
-            self.runs += 1
-            return super().run(scene, patience_s)
+    def counting(model: Model) -> Runner:
+        made.append(Counting(model))
+        return made[-1]
 
     model = Steady()
-    road = Road(profile, model, clock, run_by=Chosen)
+    road = Road(profile, model, clock, run_by=counting)
     road.predict(5, at_s=0.0)
     assert [one.runs for one in made] == [len(model.scenes)] == [1]
 
