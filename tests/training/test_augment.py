@@ -68,6 +68,16 @@ def test_clutter_is_beside_the_target_and_never_the_target(windows: Windows) -> 
     assert float(moved[seen].max()) == 0.0
 
 
+def test_a_standing_thing_may_be_seen_now_here_now_there(windows: Windows) -> None:
+    batch, before = augmented(windows, parked=1.0, wander_m=0.5), windows.tensors()
+    here = before["history"][:, :1, -1]
+    torch.testing.assert_close(batch["history"][:, 0, -1:], here)
+    offset = torch.cat([batch["history"][:, 0], batch["future"]], 1) - here
+    assert 0.05 < float(offset.std()) < 0.7
+    assert float(offset.diff(dim=1).std()) < 0.3 * float(offset.std())  # without jumps
+    torch.testing.assert_close(batch["history"][:, 1:], before["history"][:, 1:])
+
+
 def test_a_ghost_moves_with_the_target(windows: Windows) -> None:
     batch, before = augmented(windows, ghost=1.0), windows.tensors()
     offset = batch["history"] - before["history"][:, :1]

@@ -17,6 +17,8 @@ Batch = dict[str, Tensor]
 
 GHOST_M = 1.5
 """A radar sees a vehicle at its corners, wheels and through its underbody."""
+WANDER_STEPS = 15.0
+"""Over so many steps the place of a reflection on a standing thing forgets where it was."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +39,9 @@ class AugmentConfig:
     """So has everybody: a queue."""
     clutter: float = 0.0
     """Per neighbour: it is a thing beside the road that has never moved."""
+    wander_m: float = 0.0
+    """Standard deviation of how far the sensor's point on a thing that stands moves about: its
+    reflection runs along a wall. Each thing draws its own below it."""
     ghost: float = 0.0
     """Per neighbour: it is a second reflection of the target, within some metres."""
     alone: float = 0.0
@@ -70,13 +75,15 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
     agents = batch["history"].shape[1]
     still = chance(config.clutter, windows, agents)
     still[:, 0] = chance(config.parked, windows)
-    batch = _stood(batch, still | chance(config.standing, windows, 1))
+    still |= chance(config.standing, windows, 1)
+    steps, ahead = batch["history"].shape[2], batch["future"].shape[1]
+    wander = _wander(config.wander_m, (windows, agents), steps, ahead, generator)
+    batch = _stood(batch, still, wander)
     batch = _ghosts(batch, chance(config.ghost, windows, agents), generator)
     batch = _scaled(batch, _scales(windows, config, generator))
     batch = _mirrored(batch, chance(config.mirrored, windows))
     if config.rotated:
         batch = _rotated(batch, chance(config.rotated, windows), generator)
-    steps = batch["history_valid"].shape[2]
     lines = batch["centerlines_valid"].shape[1]
     first = torch.randint(0, steps, (windows, 1, 1), generator=generator)
     late = chance(config.short_history, windows, 1, 1) & (torch.arange(steps) < first)
@@ -96,15 +103,38 @@ def augment(batch: Batch, config: AugmentConfig, generator: torch.Generator) -> 
     }
 
 
-def _stood(batch: Batch, still: Tensor) -> Batch:
+def _stood(batch: Batch, still: Tensor, wander: Tensor) -> Batch:
     """The agents `still` (B, N) have never moved, and a target among them never will.
 
-    Agents that are not seen now keep their past: where they are now is not known.
+    All but `wander` (B, N, T + H, 2), which is 0 now. Agents that are not seen now keep their past:
+    where they are now is not known.
     """
     last = batch["history"][:, :, -1:]  # (B, N, 1, 2)
     still = (still & batch["history_valid"][:, :, -1])[..., None, None]  # (B, N, 1, 1)
-    future = torch.where(still[:, 0], last[:, 0], batch["future"])
-    return batch | {"history": torch.where(still, last, batch["history"]), "future": future}
+    past, ahead = (last + wander).split([batch["history"].shape[2], batch["future"].shape[1]], 2)
+    return batch | {
+        "history": torch.where(still, past, batch["history"]),
+        "future": torch.where(still[:, 0], ahead[:, 0], batch["future"]),
+    }
+
+
+def _wander(
+    deviation_m: float, shape: tuple[int, int], past: int, ahead: int, generator: torch.Generator
+) -> Tensor:
+    """(*shape, past + ahead, 2) relative to the last of the past: a smooth random process each.
+
+    Gaussian, with the Matern covariance of order 3/2 (Rasmussen & Williams, Gaussian Processes for
+    Machine Learning, eq. 4.17) over WANDER_STEPS.
+    """
+    steps = torch.arange(past + ahead)
+    if deviation_m == 0.0:
+        return torch.zeros((*shape, len(steps), 2))
+    apart = 3.0**0.5 * (steps[:, None] - steps).abs() / WANDER_STEPS
+    covariance = ((1.0 + apart) * torch.exp(-apart)).double()
+    root = torch.linalg.cholesky(covariance + 1e-6 * torch.eye(len(steps))).float()
+    level = deviation_m * torch.rand((*shape, 1, 1), generator=generator) ** 2  # mostly little
+    paths = level * (root @ torch.randn((*shape, len(steps), 2), generator=generator))
+    return paths - paths[:, :, past - 1 : past]
 
 
 def _ghosts(batch: Batch, ghost: Tensor, generator: torch.Generator) -> Batch:

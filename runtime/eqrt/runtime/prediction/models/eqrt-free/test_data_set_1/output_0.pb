@@ -1,1 +1,1 @@
-BtrajectoriesJð'ØÃûUUCluØÃI_VC¤ÄØÃhWC¯ÙÃ¤qXCˆeÙÃszYC,·ÙÃå‚ZCš	ÚÃèŠ[CÔ\ÚÃp’\CÙ°ÚÃr™]C¬ÛÃæŸ^CM[ÛÃÆ¥_C»±ÛÃ«`C÷ÜÃ¶¯aCþ`ÜÃ½³bCÍ¹ÜÃ·cC`ÝÃ×¹dC±mÝÃá»eC¹ÈÝÃ:½fCp$ÞÃÝ½gCÍ€ÞÃÇ½hCÇÝÞÃö¼iCT;ßÃi»jCk™ßÃ!¹kCøßÃ"¶lCWàÃq²mCŸ¶àÃ®nCšáÃ/©oC	wáÃÅ£pCò×áÃûqC`9âÃö—rC
+BtrajectoriesJðO)ØÃÒUUC,yØÃÿ^VCyÉØÃ1hWCjÙÃIqXC"lÙÃ/zYC·¾ÙÃÍ‚ZC3ÚÃ‹[C˜fÚÃí’\Cà»ÚÃTš]CÛÃ<¡^CöhÛÃž§_C¬ÀÛÃq­`CÜÃ±²aC,rÜÃX·bCâËÜÃd»cC1&ÝÃÓ¾dCÝÃ¢ÁeCŠÜÝÃÔÃfC‘8ÞÃjÅgC+•ÞÃhÆhCZòÞÃÕÆiC PßÃºÆjC}®ßÃ$ÆkCnàÃ#ÅlCìlàÃÍÃmCèÌàÃ<ÂnCH-áÃÀoCéáÃò¾pC—îáÃ“½qCOâÃ¨¼rC

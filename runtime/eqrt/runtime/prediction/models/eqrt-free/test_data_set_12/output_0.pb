@@ -1,2 +1,1 @@
-BtrajectoriesJПщывцNTCСывцеNTCЯывцOTCЕывц	OTCьывцОNTCяывцпNTCсывц╥NTCщывц╝NTCОывц╣NTCзвцмNTC звцПNTC9звцOTCOзвцHOTC`звцtOTCkзвц≥OTCoзвц╥OTClзвцмOTCeзвцэOTC\звцХOTCSзвцУOTCMзвц
-PTCOзвц+PTCYзвц_PTCoзвц╙PTC░звцQTC╩звц┼QTCИзвцRTCшвц╖RTC*швц%STCшвцqSTC
+BtrajectoriesJПиывцХLTCНывцЩLTCзвцMTC)звц7MTCCзвцgMTC[звц╕MTCsзвцЯMTC┼звцHNTC║звц╔NTC╥звцOTCмзвцhOTCЮзвцфOTCРзвцPTCшвцhPTCшвц╗PTCшвцщPTCшвцQTCшвц"QTCшвц5QTCшвцBQTCшвцLQTCЬзвцVQTCЙзвцeQTCщзвцzQTCрзвц≥QTCйзвццQTCхзвцЫQTCнзвц6RTCчзвцvRTCЭзвц╟RTC

@@ -1,2 +1,1 @@
-BtrajectoriesJð÷(ØÃËSUCäxØÃJZVC’ÉØÃ3`WC!ÙÃoeXCŸmÙÃîiYCÁÙÃ mZCxÚÃyp[CÄjÚÃqr\CêÀÚÃ‚s]CÖÛÃªs^CxoÛÃér_C½ÇÛÃAq`C• ÜÃ¶naCñyÜÃOkbCÅÓÜÃgcC
-.ÝÃbdC¹ˆÝÃF\eCÏãÝÃÈUfCL?ÞÃ›NgC1›ÞÃÈFhC÷ÞÃX>iC;TßÃM5jCa±ßÃ«+kCíàÃp!lCÕlàÃ–mCËàÃnCd)áÃÒþnCÅ‡áÃ¾ñoCíåáÃ¶ãpCCâÃ’ÔqC
+BtrajectoriesJðn)ØÃàPUCyØÃíUVCÊØÃ;[WCpÙÃ@`XCžmÙÃ˜dYC¯ÀÙÃügZC¢ÚÃBj[CjiÚÃTk\Cô¾ÚÃ*k]C*ÛÃÈi^CòkÛÃ:g_C4ÃÛÃc`CØÜÃÙ^aCÊrÜÃ'YbCûÊÜÃˆRcC^#ÝÃKdCí{ÝÃ¢BeC¥ÔÝÃa9fC‰-ÞÃ>/gCž†ÞÃ3$hCëßÞÃ5iCx9ßÃ=jCL“ßÃCýjCjíßÃHîkCÐGàÃSÞlCq¢àÃyÍmC4ýàÃâ»nCñWáÃË©oCk²áÃŽ—pCMâÃ¨…qC
