@@ -111,10 +111,10 @@ def _stood(batch: Batch, still: Tensor, wander: Tensor) -> Batch:
     """
     last = batch["history"][:, :, -1:]  # (B, N, 1, 2)
     still = (still & batch["history_valid"][:, :, -1])[..., None, None]  # (B, N, 1, 1)
-    past, ahead = (last + wander).split([batch["history"].shape[2], batch["future"].shape[1]], 2)
+    places, past = last + wander, batch["history"].shape[2]
     return batch | {
-        "history": torch.where(still, past, batch["history"]),
-        "future": torch.where(still[:, 0], ahead[:, 0], batch["future"]),
+        "history": torch.where(still, places[:, :, :past], batch["history"]),
+        "future": torch.where(still[:, 0], places[:, 0, past:], batch["future"]),
     }
 
 
@@ -133,7 +133,7 @@ def _wander(
     covariance = ((1.0 + apart) * torch.exp(-apart)).double()
     root = torch.linalg.cholesky(covariance + 1e-6 * torch.eye(len(steps))).float()
     level = deviation_m * torch.rand((*shape, 1, 1), generator=generator) ** 2  # mostly little
-    paths = level * (root @ torch.randn((*shape, len(steps), 2), generator=generator))
+    paths: Tensor = level * (root @ torch.randn((*shape, len(steps), 2), generator=generator))
     return paths - paths[:, :, past - 1 : past]
 
 
