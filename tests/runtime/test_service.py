@@ -26,7 +26,7 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.play import OTHERS, Player
-from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Service
+from eqrt.runtime.service import MAX_QUEUED_S, ArrivalClock, Service, both_clocks
 from eqrt.runtime.status_book import StatusBook, status_line
 from forecast_sets import many, nobody, one_car
 
@@ -111,6 +111,43 @@ def test_the_time_told_never_goes_back() -> None:
 
 
 # --- the loop
+
+
+class HeldUp:
+    """Two clocks, and a program that loses its processor after these of its looks at one."""
+
+    def __init__(self, after: set[int]) -> None:
+        self.now_s, self.looks, self._after = 50.0, 0, after
+
+    def monotonic(self) -> float:
+        return self._look()
+
+    def time(self) -> float:
+        return 1000.0 + self._look()
+
+    def _look(self) -> float:
+        seen_s = self.now_s
+        self.now_s += 0.25 if self.looks in self._after else 2.0**-20
+        self.looks += 1
+        return seen_s
+
+
+@pytest.mark.parametrize(("after", "looks"), [(set(), 3), ({0}, 6), ({1}, 6), ({0, 3}, 9)])
+def test_both_clocks_are_of_one_moment(
+    monkeypatch: pytest.MonkeyPatch, after: set[int], looks: int
+) -> None:
+    clocks = HeldUp(after)
+    monkeypatch.setattr("eqrt.runtime.service.time", clocks)
+    monotonic_s, wall_s = both_clocks()
+    assert wall_s - monotonic_s == 1000.0 + 2.0**-20
+    assert clocks.looks == looks
+
+
+def test_who_is_held_up_at_every_look_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = HeldUp(set(range(1000)))
+    monkeypatch.setattr("eqrt.runtime.service.time", clocks)
+    both_clocks()
+    assert clocks.looks == 9
 
 
 class Said:

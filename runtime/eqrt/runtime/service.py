@@ -20,6 +20,8 @@ _REPORT_S = 1.0
 MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but another clock
 _SET_S = 0.05  # a wall clock that moves by more was set; NTP slews by less than 1 ms a second
 _ROUNDED_S = 1e-3  # by which a stamp may lie ahead of now, because it has a coarser clock
+_TOGETHER_S = 1e-3  # two looks at a clock take some 0.1 us, where each is a system call 60 us
+_LOOKS = 3  # who is held up each time must go on nevertheless
 _MOST_WALLS = 8  # more than anybody sets it within MAX_QUEUED_S; bounds the work of each message
 
 
@@ -116,11 +118,12 @@ class Service:
         """
         message = self._receiver.recv(_NAP_S)
         if message is None:
-            monotonic_s, wall_s = time.monotonic(), time.time()
+            monotonic_s, wall_s = both_clocks()
             message = self._receiver.recv(0.0)
             if message is None:
                 return None, self._clock.now_s(monotonic_s, None, wall_s)
-        return message, self._clock.now_s(time.monotonic(), message.timestamp, time.time())
+        monotonic_s, wall_s = both_clocks()
+        return message, self._clock.now_s(monotonic_s, message.timestamp, wall_s)
 
     def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
         for forecast in forecasts:
@@ -134,6 +137,19 @@ class Service:
         for observe in self._observers:
             observe(status)
         return max(due_s + _REPORT_S, now_s)
+
+
+def both_clocks() -> tuple[float, float]:
+    """The monotonic clock and the wall clock, seconds, at one moment.
+
+    A program that loses its processor between two looks looks again: else the one would seem to
+    have been set against the other, and what arrived to be older by as much.
+    """
+    for _ in range(_LOOKS):
+        monotonic_s, wall_s = time.monotonic(), time.time()
+        if time.monotonic() - monotonic_s < _TOGETHER_S:
+            break
+    return monotonic_s, wall_s
 
 
 class ArrivalClock:
