@@ -103,6 +103,12 @@ CHANGES = (
         " --datagrams 127.0.0.1:47394 --port 0",
         "the usual addresses may be taken",
     ),
+    Change(
+        r"^eqrt train .*eqrt-small",
+        r"--data data/ngsim( --data data/bologna)?",
+        "--data data/av1",
+        "two of NGSIM's recordings leave none to hold out",
+    ),
     Change(r"^eqrt train ", r"( --steps \d+)?$", " --steps 2", "two steps instead of thousands"),
     Change(
         r"^eqrt bench(?! --service)(?!.*--budget)",
