@@ -16,7 +16,7 @@ MUTATION_JOBS ?= 1
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures systems-table view-figures faults soak load under-load recording-cost clean
+.PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures systems-table view-figures view-picture faults soak load under-load recording-cost clean
 
 help: ## list what can be made
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -77,6 +77,9 @@ systems-table: $(VENV)/.installed ## put all systems side by side into docs/: ti
 
 view-figures: $(VENV)/.installed ## print what watching costs: frames of the page, latency beside browsers
 	@PYTHONPATH=tests $(VENV)/bin/python tests/bench/view_figures.py
+
+view-picture: $(VENV)/.installed ## take docs/view.png anew
+	@PYTHONPATH=tests $(VENV)/bin/python tests/bench/view_picture.py
 
 faults: $(VENV)/.installed ## throw faults at messages, machine and model, then kill the service 100 times; in 6 minutes
 	FAULT_EXAMPLES=200 $(VENV)/bin/python -m pytest -q tests/faults/test_pipeline_machine.py

@@ -27,8 +27,9 @@ EQRT = [sys.executable, "-m", "eqrt"]
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Ours, and the car's sources on the path."""
-    return os.environ | {"PYTHONPATH": str(ROOT / "runtime")} | more
+    """Ours, and the car's sources on the path, which are compiled once, as installed ones are."""
+    ours = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return ours | {"PYTHONPATH": str(ROOT / "runtime")} | more
 
 
 def eqrt(

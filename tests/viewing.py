@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import signal
 import socket
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-from processes import EQRT, PATIENCE_S, environment
+from drives import Drive
+from eqrt.runtime.bus.buses import LOCAL
+from processes import EQRT, PATIENCE_S, Heard, Serving, environment, playing
 from source_tree import ROOT
 
 ARTIFACTS = ROOT / ".artifacts"
@@ -56,6 +60,20 @@ class Viewing:
         if self.process.poll() is None:
             self.process.kill()
             self.process.communicate()
+
+
+@contextlib.contextmanager
+def watched(drive: Drive, log: Path) -> Iterator[tuple[Viewing, Heard, Serving]]:
+    """The demo's recording played in a loop to a service that a view and a listener follow."""
+    channel = next(CHANNELS)
+    can = ["--can", channel, "--can-interface", LOCAL]
+    with contextlib.ExitStack() as stack:
+        viewing = stack.enter_context(Viewing())
+        heard = stack.enter_context(Heard(channel, []))
+        to = [f"--datagrams={address}" for address in (viewing.datagrams, heard.address)]
+        serving = stack.enter_context(Serving(*can, *drive.options, *to, "--quiet"))
+        stack.enter_context(playing(log, "--can", channel, "--loop"))
+        yield viewing, heard, serving
 
 
 def free_udp_port() -> int:

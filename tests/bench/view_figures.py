@@ -22,10 +22,9 @@ from websockets.asyncio.client import connect
 
 from browser import Browser
 from drives import DRIVES
-from eqrt.runtime.bus.buses import LOCAL
-from processes import Heard, Serving, environment, playing
+from processes import environment
 from source_tree import ROOT
-from viewing import CHANNELS, Viewing
+from viewing import Viewing, watched
 
 AGENTS, WARM_S, MEASURED_S = 64, 8.0, 15.0
 ROUNDS, SETTLE_S, CASE_S = 3, 4.0, 12.0
@@ -86,7 +85,7 @@ def sending(address: str) -> Iterator[None]:
 
 def latencies() -> Iterator[str]:
     """Every case in every round; percentiles over all rounds of a case."""
-    channel, drive = next(CHANNELS), DRIVES["ngsim"]
+    drive = DRIVES["ngsim"]
     cases: dict[str, Callable[[Viewing], contextlib.AbstractContextManager[None]]] = {
         "nobody: no eqrt view": stopped_view,
         "eqrt view, no page": lambda _: contextlib.nullcontext(),
@@ -95,21 +94,15 @@ def latencies() -> Iterator[str]:
         "1 Chromium, stopped (SIGSTOP)": stopped_browser,
     }
     found_s: dict[str, list[float]] = {name: [] for name in cases}
-    with Viewing() as viewing, Heard(channel, []) as heard:
-        to = [f"--datagrams={address}" for address in (viewing.datagrams, heard.address)]
-        can = ["--can", channel, "--can-interface", LOCAL]
-        with (
-            Serving(*can, *drive.options, *to, "--quiet"),
-            playing(drive.log, "--can", channel, "--loop"),
-        ):
-            for _ in range(ROUNDS):
-                for name, case in cases.items():
-                    with case(viewing):
-                        time.sleep(SETTLE_S)
-                        seen = len(heard.statuses)
-                        time.sleep(CASE_S)
-                        for status in heard.statuses[seen + 1 :]:
-                            found_s[name] += status.latencies_s
+    with watched(drive, drive.log) as (viewing, heard, _):
+        for _round in range(ROUNDS):
+            for name, case in cases.items():
+                with case(viewing):
+                    time.sleep(SETTLE_S)
+                    seen = len(heard.statuses)
+                    time.sleep(CASE_S)
+                    for status in heard.statuses[seen + 1 :]:
+                        found_s[name] += status.latencies_s
     yield f"{'':34}{'cycles':>7}{'p50':>8}{'p99':>8}{'worst':>8}  ms"
     for name, values in found_s.items():
         p50, p99 = 1e3 * np.quantile(values, [0.5, 0.99])

@@ -405,6 +405,27 @@ def test_a_replay_is_as_late_as_the_service_was(tmp_path: Path) -> None:
     assert Mode.LATE in {one.mode for one in again}
 
 
+def test_entries_leave_when_a_cycle_is_published(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And not between its messages, where their writer would be at work beside the model."""
+    monkeypatch.setattr("eqrt.runtime.recording.recorder._BATCH_S", 60.0)
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), stationary=True)
+    identity = identity_of(pipeline, model_folder=Path("x"), channels=None, stationary=True)
+    seen = []
+    clock, runs = TapedClock(time.monotonic), RunTape()
+    with Recorder(order(tmp_path, identity), clock, runs) as recorder:
+        for message in traffic([Car(object_id=1, x_m=20.0, y_m=3.0)], 1.0):
+            before = recorder.counts()["recording_bytes"]
+            recorder.begin(message, message.timestamp)
+            made = pipeline.feed(message, message.timestamp)
+            for forecast in made:
+                recorder.publish(forecast)
+            recorder.end()
+            seen.append((bool(made), recorder.counts()["recording_bytes"] > before))
+    assert set(seen) == {(True, True), (False, False)}
+
+
 def test_a_writer_that_stands_still_costs_entries_but_never_time(tmp_path: Path) -> None:
     """What does not fit is counted, the recording says how much is missing, and so does replay."""
     started_s = time.monotonic()

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import can
 import numpy as np
+from numpy.typing import NDArray
 
 from drives import TILE, shipped_predictor
 from eqrt.runtime.bench.service.crowd import PROFILE, crowded_cycles
@@ -51,17 +52,20 @@ class Soak:
     name: str
     seconds: float
     times_s: list[float] = field(default_factory=list)
-    resident_mib: list[float] = field(default_factory=list)
+    memory_mib: list[tuple[float, float]] = field(default_factory=list)
+    """Of the process's own data, and of pages of files (programs and libraries)."""
     modes: Counter[str] = field(default_factory=Counter)
     targets: Counter[str] = field(default_factory=Counter)
     latest_s: float = 0.0
     notes: str = ""
 
     def look(self, time_s: float, pid: int) -> None:
-        """Note the memory of a process."""
-        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
+        """Note the memory of a process: every page counted (`statm` may be some pages off)."""
+        _, *lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
+        mib = {name: int(size.split()[0]) / 1024 for name, size in (x.split(":") for x in lines)}
+        own = mib["Anonymous"]
         self.times_s.append(time_s)
-        self.resident_mib.append(pages * os.sysconf("SC_PAGE_SIZE") / MIB)
+        self.memory_mib.append((own, mib["Rss"] - own))
 
     def heard(self, forecast: ForecastSet) -> None:
         """Count a cycle."""
@@ -70,22 +74,34 @@ class Soak:
         for value, count in zip(values.tolist(), counts.tolist(), strict=True):
             self.targets[Mode(value).name] += count
 
-    def slope_mib_per_day(self) -> float:
-        """Of the least-squares line through the resident size, after the warm-up."""
-        times_s, resident = np.array(self.times_s), np.array(self.resident_mib)
+    @property
+    def resident_mib(self) -> NDArray[np.float64]:
+        """All of it, at every look."""
+        own, files = np.array(self.memory_mib).T
+        resident: NDArray[np.float64] = own + files
+        return resident
+
+    def slopes_mib_per_day(self) -> tuple[float, float]:
+        """Of the least-squares lines through both kinds of memory, after the warm-up."""
+        times_s, memory = np.array(self.times_s), np.array(self.memory_mib)
         kept = times_s >= times_s[0] + WARM_UP * (times_s[-1] - times_s[0])
-        return float(np.polyfit(times_s[kept], resident[kept], 1)[0]) * DAY_S
+        own, files = np.polyfit(times_s[kept], memory[kept], 1)[0] * DAY_S
+        return float(own), float(files)
 
     def lines(self) -> Iterator[str]:
         """For the terminal."""
         hours = self.seconds / 3600.0
         yield f"{self.name}: {hours:.2f} h, {sum(self.modes.values())} cycles"
         yield f"  modes of cycles: {_counted(self.modes)}; of objects: {_counted(self.targets)}"
-        begin, end = self.resident_mib[0], self.resident_mib[-1]
-        middle = float(np.interp(WARM_UP * self.seconds, self.times_s, self.resident_mib))
+        resident, (own, files) = self.resident_mib, self.slopes_mib_per_day()
+        middle = float(np.interp(WARM_UP * self.seconds, self.times_s, resident))
         yield (
-            f"  memory: {begin:.1f} MiB at first, {middle:.1f} after the warm-up, {end:.1f} in the "
-            f"end, at most {max(self.resident_mib):.1f}; {self.slope_mib_per_day():+.2f} MiB a day"
+            f"  memory: {resident[0]:.1f} MiB at first, {middle:.1f} after the warm-up, "
+            f"{resident[-1]:.1f} in the end, at most {max(resident):.1f}"
+        )
+        yield (
+            f"  slope: {own + files:+.2f} MiB a day, of which {own:+.2f} its own data, "
+            f"{files:+.2f} pages of programs and libraries"
         )
         if self.notes:
             yield f"  {self.notes}"
@@ -189,6 +205,9 @@ def _listen(soak: Soak, ear: socket.socket, pid: int, seconds: float) -> Service
             soak.latest_s = max([soak.latest_s, *told.latencies_s])
             if not soak.times_s or now_s - begun_s >= soak.times_s[-1] + 10.0:
                 soak.look(now_s - begun_s, pid)
+                if len(soak.times_s) % 30 == 1:
+                    own, files = soak.memory_mib[-1]
+                    print(f"  {soak.times_s[-1] / 60.0:5.1f} min {own:.2f} + {files:.2f} MiB")
     assert last is not None, "no status came"
     return last
 

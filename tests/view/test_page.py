@@ -19,34 +19,19 @@ import pytest
 
 from browser import Browser
 from crowd import crowd, cycles
-from drives import DEMO, DRIVES, TILE, Drive
+from drives import DEMO, DRIVES, TILE
 from eqrt.core.frames import Pose2
-from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.output.datagrams import DatagramPublisher
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.prediction.tiles import load_tile
-from processes import PATIENCE_S, Heard, Serving, playing
-from viewing import CHANNELS, Viewing, artifact
+from processes import PATIENCE_S, Heard, Serving
+from viewing import Viewing, artifact, watched
 
 TILE_ID = load_tile(TILE).info.tile_id
 FULL_SERVICE = "e.words === 'Full service: model, map and ego motion'"
 """What a machine that does much else says now and then only."""
 LOGS = {"ngsim": DRIVES["ngsim"].log, "rav4": DEMO / "rav4.log.gz"}
-
-
-@contextlib.contextmanager
-def watched(drive: Drive, log: Path) -> Iterator[tuple[Viewing, Heard, Serving]]:
-    """The demo's recording played in a loop to a service that a view and a listener follow."""
-    channel = next(CHANNELS)
-    can = ["--can", channel, "--can-interface", LOCAL]
-    with contextlib.ExitStack() as stack:
-        viewing = stack.enter_context(Viewing())
-        heard = stack.enter_context(Heard(channel, []))
-        to = [f"--datagrams={address}" for address in (viewing.datagrams, heard.address)]
-        serving = stack.enter_context(Serving(*can, *drive.options, *to, "--quiet"))
-        stack.enter_context(playing(log, "--can", channel, "--loop"))
-        yield viewing, heard, serving
 
 
 @pytest.fixture(scope="module")

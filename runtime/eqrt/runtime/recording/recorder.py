@@ -86,7 +86,11 @@ class Recorder:
         self._put_clock()
         if outcomes := self._runs.take():
             self._put(Topic.RUNS, _MSGPACK.encode(outcomes))
-        if self._batch_bytes >= _BATCH_BYTES or time.monotonic() >= self._due_s:
+        if (
+            self._in_batch[Topic.FORECASTS]  # the writer works while the service has least to do
+            or self._batch_bytes >= _BATCH_BYTES
+            or time.monotonic() >= self._due_s
+        ):
             self.flush()
 
     def describe(self, description: Description) -> None:
