@@ -115,6 +115,22 @@ def test_the_last_five_seconds_are_remembered_at_a_hundred_messages_a_second_eac
     assert_pose(tracker.map_from_ego(54.99), 54.985, 0.0, 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("source", ["motion", "poses"])
+@pytest.mark.parametrize("per_s", [1, 10, 50])
+def test_ten_seconds_are_remembered_and_twenty_at_most(source: str, per_s: int) -> None:
+    """However long it drives: a service that runs for days must not grow."""
+    tracker = EgoTracker(max_pose_age_s=1.0)
+    for tick in range(100 * per_s + 1):
+        time_s = tick / per_s
+        if source == "motion":
+            tracker.motion(EgoMotion(timestamp_s=time_s, speed_mps=1.0, yaw_rate_rad_s=0.0))
+        else:
+            give_pose(tracker, time_s, time_s, 0.0, 0.0)
+        if time_s > 30.0:
+            assert_pose(tracker.map_from_ego(time_s - 9.9), time_s - 9.9, 0.0, 0.0)
+            assert tracker.map_from_ego(time_s - 21.1) is None
+
+
 def test_without_input_there_is_no_pose_unless_the_sensor_never_moves() -> None:
     assert EgoTracker().map_from_ego(1.0) is None
     state = EgoTracker(stationary=True).at(1.0)

@@ -8,7 +8,7 @@ dead reckoning began.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -19,6 +19,8 @@ MAX_EXTRAPOLATION_S = 0.2
 """How far past the time when both signals were last known their values are held."""
 MAX_GAP_S = 1.0
 """A signal silent for longer, or a clock that steps by more, breaks the dead reckoning."""
+KEPT_S = 10.0
+"""At least so much of the past is kept, and at most twice as much: no history is longer."""
 _MAX_NODES = 4096  # then the older half is forgotten: 5 s stay even at 400 samples/s
 
 
@@ -34,6 +36,17 @@ class OdometryState(NamedTuple):
     """Scale applied."""
     yaw_rate_rad_s: float
     """Bias removed."""
+
+
+def num_forgotten(times: list[float], max_count: int) -> int:
+    """How many of the oldest may go, seldom and then many at once, so that it costs next to
+    nothing: those before KEPT_S once they reach twice as far back, or half of too many.
+    """
+    if len(times) > max_count:
+        return max_count // 2
+    if times[0] < times[-1] - 2.0 * KEPT_S:
+        return bisect_left(times, times[-1] - KEPT_S) - 1
+    return 0
 
 
 class Odometry:
@@ -112,8 +125,8 @@ class Odometry:
             self._states.append(state)
         self._speed.forget_before(self._times[-1])
         self._yaw_rate.forget_before(self._times[-1])
-        if len(self._times) > _MAX_NODES:
-            del self._times[: _MAX_NODES // 2], self._states[: _MAX_NODES // 2]
+        forgotten = num_forgotten(self._times, _MAX_NODES)
+        del self._times[:forgotten], self._states[:forgotten]
 
     def _walk(self, until_s: float) -> Iterator[tuple[float, OdometryState]]:
         """States after the newest settled one: at every sample's time, the last at `until_s`."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from eqrt.core.frames import Pose2
 from eqrt.runtime.tracking.arcs import between, steady_motion
+from eqrt.runtime.tracking.odometry import num_forgotten
 
 _MAX_POSES = 1024  # then the older half is forgotten: 5 s stay at 100 Hz
 
@@ -42,8 +43,8 @@ class PoseTrack:
         """Take a pose newer than all before."""
         self._times.append(timestamp_s)
         self._poses.append(map_from_ego)
-        if len(self._times) > _MAX_POSES:
-            del self._times[: _MAX_POSES // 2], self._poses[: _MAX_POSES // 2]
+        forgotten = num_forgotten(self._times, _MAX_POSES)
+        del self._times[:forgotten], self._poses[:forgotten]
 
     def clear(self) -> None:
         """Forget all poses."""
