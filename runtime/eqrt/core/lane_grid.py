@@ -131,8 +131,10 @@ def ranges(begin: Index, count: Index) -> Index:
 def least_of_each(group: Index, metres: Float64) -> Index:
     """Index of the least of each group, by rising group; of equal ones, the first."""
     order = np.argsort(group, kind="stable")
-    start = np.flatnonzero(np.diff(group[order], prepend=-1))
-    return order[_least(metres[order], start)]
+    sorted_ = group[order]
+    begins = np.ones(len(group), np.bool_)
+    np.not_equal(sorted_[1:], sorted_[:-1], out=begins[1:])
+    return order[_least(metres[order], np.flatnonzero(begins))]
 
 
 def _least(values: Float64, start: Index) -> Index:
@@ -140,7 +142,10 @@ def _least(values: Float64, start: Index) -> Index:
     if not len(start):
         return start
     least = np.minimum.reduceat(values, start)
-    hit = np.flatnonzero(values == np.repeat(least, np.diff(start, append=len(values))))
+    count = np.empty_like(start)
+    np.subtract(start[1:], start[:-1], out=count[:-1])
+    count[-1] = len(values) - start[-1]
+    hit = np.flatnonzero(values == np.repeat(least, count))
     return hit[np.searchsorted(hit, start)]
 
 

@@ -151,7 +151,7 @@ def direction_of_motion(agents: AgentHistories, last: Float64) -> Float64:
     recent = agents.valid[:, -DIRECTION_STEPS - 1 :]
     first = agents.positions[np.arange(len(recent)), -recent.shape[1] + np.argmax(recent, axis=1)]
     moved = np.where(np.any(recent, axis=1, keepdims=True), last - first, 0.0)
-    length = np.linalg.norm(moved, axis=1, keepdims=True)
+    length = np.hypot(moved[:, :1], moved[:, 1:])
     unit = moved / np.maximum(length, MIN_MOTION_M)
     return np.where(length >= MIN_MOTION_M, unit, agents.heading)
 
@@ -165,9 +165,11 @@ def _scene_rows(
     distance = np.where(recent, np.square(offset).sum(-1), np.inf)
     distance[np.arange(len(targets)), targets] = -1.0  # the target comes first
     order = np.argsort(distance, axis=1, kind="stable")[:, :num_agents]
-    present = np.isfinite(np.take_along_axis(distance, order, axis=1))
-    missing = num_agents - order.shape[1]
-    return np.pad(order, ((0, 0), (0, missing))), np.pad(present, ((0, 0), (0, missing)))
+    rows = np.zeros((len(targets), num_agents), np.intp)
+    present = np.zeros(rows.shape, np.bool_)
+    rows[:, : order.shape[1]] = order
+    present[:, : order.shape[1]] = np.isfinite(distance[np.arange(len(order))[:, None], order])
+    return rows, present
 
 
 def _centerlines(

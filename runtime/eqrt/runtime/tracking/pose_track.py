@@ -6,7 +6,7 @@ from bisect import bisect_right
 from typing import NamedTuple
 
 from eqrt.core.frames import Pose2
-from eqrt.runtime.tracking.arcs import between, steady_motion
+from eqrt.runtime.tracking.arcs import arc, steady_motion
 from eqrt.runtime.tracking.odometry import num_forgotten
 
 _MAX_POSES = 1024  # then the older half is forgotten: 5 s stay at 100 Hz
@@ -60,9 +60,10 @@ class PoseTrack:
             return None
         start, end = self._poses[after - 1 : after + 1]
         rate = 1.0 / (end_s - start_s)
+        fraction = rate * (timestamp_s - start_s)
         forward_m, left_m, turn_rad = steady_motion(start, end)
         return MovingPose(
-            between(start, end, rate * (timestamp_s - start_s)),
+            start @ arc(fraction * forward_m, fraction * turn_rad, fraction * left_m),
             (rate * forward_m, rate * left_m),
             rate * turn_rad,
         )
