@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from eqrt.core.contract import ModelContract
 from eqrt.core.scene import (
     AgentHistories,
     build_scene,
+    build_scenes,
     concatenate,
     direction_of_motion,
     last_seen,
@@ -127,3 +130,23 @@ def test_scenes_of_one_origin_become_one_batch() -> None:
         np.testing.assert_array_equal(value, both.inputs()[name])
     with pytest.raises(ValueError, match="origins"):
         concatenate([one, build_scene(agents, np.array([1]), CONTRACT, None, ORIGIN + 1)])
+
+
+def test_groups_on_clocks_of_their_own_are_one_batch_and_one_search_for_lanes() -> None:
+    searches = []
+
+    class Counting(OneLane):
+        def centerlines_batch(self, positions: np.ndarray, *more: Any) -> tuple[Any, Any]:
+            searches.append(len(positions))
+            return super().centerlines_batch(positions, *more)
+
+    groups = [
+        (agents_at([(0, 0), (4, 0), (9, 3)]), np.array([0, 2])),
+        (agents_at([(-1, 0), (3, 0), (8, 3)], speed_mps=5.0), np.array([1])),
+    ]
+    together = build_scenes(groups, CONTRACT, Counting(), ORIGIN)
+    assert searches == [3]
+    apart = [build_scene(agents, rows, CONTRACT, OneLane(), ORIGIN) for agents, rows in groups]
+    for name, value in concatenate(apart).inputs().items():
+        np.testing.assert_array_equal(together.inputs()[name], value)
+        assert together.inputs()[name].dtype == value.dtype

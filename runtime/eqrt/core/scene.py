@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,17 +100,43 @@ def build_scene(
     Around every target stand its N - 1 nearest recently seen agents, by distance at their last seen
     step, and the Q centerlines it may follow; without `centerlines` there is no map.
     """
-    last = last_seen(agents.positions, agents.valid)  # (A, 2)
-    rows, present = _scene_rows(last, agents.valid, targets, contract.num_agents)  # (B, N)
-    history_valid = agents.valid[rows] & present[..., None]  # (B, N, T)
-    history = np.where(history_valid[..., None], agents.positions[rows] - origin, 0.0)
-    heading = agents.heading[targets]
-    points, points_valid = _centerlines(agents, last, targets, contract, centerlines)
+    return build_scenes([(agents, targets)], contract, centerlines, origin)
+
+
+def build_scenes(
+    groups: Sequence[tuple[AgentHistories, NDArray[np.intp]]],
+    contract: ModelContract,
+    centerlines: CenterlineSource | None,
+    origin: Float64,
+) -> Scene:
+    """The scenes of several groups of targets as one batch, one group after the other.
+
+    Each group has the agents on its own model clock, and is as `build_scene` makes it; lanes are
+    looked for once for all.
+    """
+    lasts = [last_seen(agents.positions, agents.valid) for agents, _ in groups]
+    history, history_valid, heading = _joined(
+        [
+            _agents_around(agents, last, targets, contract.num_agents, origin)
+            for (agents, targets), last in zip(groups, lasts, strict=True)
+        ]
+    )
+    shape = (len(history), contract.num_centerlines, contract.centerline_points)
+    points, points_valid = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+    if centerlines is not None:
+        position, direction = _joined(
+            [
+                (last[targets], direction_of_motion(agents, last)[targets])
+                for (agents, targets), last in zip(groups, lasts, strict=True)
+            ]
+        )
+        points, points_valid = centerlines.centerlines_batch(position, direction, *shape[1:])
+        points = np.where(points_valid[..., None], points - origin, 0.0)
     return Scene(
         history=history.astype(np.float32),
         history_valid=history_valid,
         heading=heading.astype(np.float32),
-        centerlines=np.where(points_valid[..., None], points - origin, 0.0).astype(np.float32),
+        centerlines=points.astype(np.float32),
         centerlines_valid=points_valid,
         origin=origin,
     )
@@ -156,6 +182,27 @@ def direction_of_motion(agents: AgentHistories, last: Float64) -> Float64:
     return np.where(length >= MIN_MOTION_M, unit, agents.heading)
 
 
+def _agents_around(
+    agents: AgentHistories,
+    last: Float64,
+    targets: NDArray[np.intp],
+    num_agents: int,
+    origin: Float64,
+) -> tuple[Float64, Bool, Float64]:
+    """history (B, N, T, 2) tile frame, history_valid (B, N, T) and heading (B, 2) of targets."""
+    rows, present = _scene_rows(last, agents.valid, targets, num_agents)  # (B, N)
+    valid = agents.valid[rows] & present[..., None]
+    history = np.where(valid[..., None], agents.positions[rows] - origin, 0.0)
+    return history, valid, agents.heading[targets]
+
+
+def _joined(parts: list[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Arrays of the groups, one group after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+
+
 def _scene_rows(
     last: Float64, valid: Bool, targets: NDArray[np.intp], num_agents: int
 ) -> tuple[NDArray[np.intp], Bool]:
@@ -170,17 +217,3 @@ def _scene_rows(
     rows[:, : order.shape[1]] = order
     present[:, : order.shape[1]] = np.isfinite(distance[np.arange(len(order))[:, None], order])
     return rows, present
-
-
-def _centerlines(
-    agents: AgentHistories,
-    last: Float64,
-    targets: NDArray[np.intp],
-    contract: ModelContract,
-    centerlines: CenterlineSource | None,
-) -> tuple[Float64, Bool]:
-    shape = (len(targets), contract.num_centerlines, contract.centerline_points)
-    if centerlines is None:
-        return np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
-    direction = direction_of_motion(agents, last)[targets]
-    return centerlines.centerlines_batch(last[targets], direction, shape[1], shape[2])

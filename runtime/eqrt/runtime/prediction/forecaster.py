@@ -13,8 +13,7 @@ from eqrt.core.scene import (
     AgentHistories,
     CenterlineSource,
     Scene,
-    build_scene,
-    concatenate,
+    build_scenes,
     tile_origin,
 )
 from eqrt.runtime.prediction.predictor import Prediction
@@ -140,12 +139,8 @@ class Forecaster:
     ) -> Scene:
         origin = tile_origin(np.array([ego.map_from_ego.x_m, ego.map_from_ego.y_m]))
         lanes = self._lanes if ego.has_map_pose else None
-        return concatenate(
-            [
-                build_scene(agents[time_s], rows, self._contract, lanes, origin)
-                for time_s, rows in batch.items()
-            ]
-        )
+        groups = [(agents[time_s], rows) for time_s, rows in batch.items()]
+        return build_scenes(groups, self._contract, lanes, origin)
 
     def _agents(self, tracks: Tracks, anchor_s: float) -> AgentHistories:
         """All tracks, and the ego vehicle after them, on the clock that ends at `anchor_s`."""
