@@ -11,6 +11,7 @@ Real: `eqrt serve` beside a process that sends ten object lists a second. Memory
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import socket
 import sys
@@ -143,6 +144,7 @@ def simulated(seconds: float, objects: int) -> Soak:
     promises = Promises(pipeline.predictor.contract.dt_s)
     publisher = CanPublisher(Nowhere())
     drive = list(crowded_cycles(objects))
+    blocks = []
     for number in range(round(seconds / PERIOD_S)):
         begun_s = number * PERIOD_S
         for message in drive[number % len(drive)]:
@@ -157,9 +159,16 @@ def simulated(seconds: float, objects: int) -> Soak:
         if number % 6000 == 0:
             soak.look(begun_s, os.getpid())
             print(f"  {begun_s / 3600.0:5.2f} h {soak.resident_mib[-1]:.1f} MiB", flush=True)
+        if number % len(drive) == 0:  # so that every look finds the drive at the same place
+            gc.collect()
+            blocks.append(sys.getallocatedblocks())
     soak.look(seconds, os.getpid())
     tracks = pipeline.tracks.counters
-    soak.notes = f"{tracks.tracks} tracks begun, {publisher.sent} CAN messages"
+    middle = blocks[round(WARM_UP * (len(blocks) - 1))]
+    soak.notes = (
+        f"{tracks.tracks} tracks begun, {publisher.sent} CAN messages; Python's blocks of memory: "
+        f"{middle} after the warm-up, {blocks[-1]} in the end"
+    )
     return soak
 
 
