@@ -20,7 +20,9 @@ MAX_EXTRAPOLATION_S = 0.2
 MAX_GAP_S = 1.0
 """A signal silent for longer, or a clock that steps by more, breaks the dead reckoning."""
 KEPT_S = 10.0
-"""At least so much of the past is kept, and at most twice as much: no history is longer."""
+"""At least so much of the past is kept, and at most twice as much. Histories of 2 s need less; to
+a model of longer ones than this, the ego vehicle's places before would not be known.
+"""
 _MAX_NODES = 4096  # then the older half is forgotten: 5 s stay even at 400 samples/s
 
 
