@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "badkey.toml": f'framming = "counted"\n{ars408}',
         "baddbc.toml": ars408.replace('"ars408.dbc"', '"bad.dbc"'),
         "nodbc.toml": ars408.replace('"ars408.dbc"', '"missing.dbc"'),
-        "bad.dbc": 'VERSION "" this is no DBC',
+        "bad.dbc": 'VERSION ""\n\nBO_ 1 is not what a DBC has',
         "notes.tile": "lanes: many",
         "notes.log": "no message\nin any line\n",
         "drive.mf4": "",
@@ -100,7 +100,11 @@ CASES: list[tuple[str, int, str]] = [  # command line, status, what is said
         1,
         r"badkey\.toml: unknown key 'framming'; the keys are",
     ),
-    ("serve --can c --profile baddbc.toml", 1, r"the DBC bad\.dbc does not parse: .*line 1"),
+    (
+        "serve --can c --profile baddbc.toml",
+        1,
+        r"the DBC bad\.dbc does not parse: .*line 3, column 10",
+    ),
     (
         "serve --can c --profile nodbc.toml",
         1,

@@ -132,6 +132,39 @@ def test_ids_and_lengths_are_those_of_cantools(dbc_path: Path) -> None:
         assert ours.length == message.length
 
 
+LONG_NAMES = """NS_ :
+	CM_
+	BA_
+	SG_MUL_VAL_
+
+BS_:
+
+BU_: CAR
+
+BO_ 7 SHORT: 8 CAR
+ SG_ S : 0|8@1+ (1,0) [0|0] "" CAR
+ SG_ OTHER : 8|8@1+ (1,0) [0|0] "" CAR
+
+CM_ SG_ 7 S "as in SG_ X : 0|8@1+ (1,0) [0|0] \\"\\" CAR; BO_ 8 X: 8 CAR";
+BA_DEF_ BO_ "SystemMessageLongSymbol" STRING ;
+BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;
+BA_DEF_DEF_ "SystemMessageLongSymbol" "";
+BA_DEF_DEF_ "SystemSignalLongSymbol" "";
+BA_ "SystemMessageLongSymbol" BO_ 7 "A_MESSAGE_OF_MORE_THAN_32_CHARACTERS";
+BA_ "SystemSignalLongSymbol" SG_ 7 S "A_SIGNAL_OF_MORE_THAN_32_CHARACTERS";
+"""
+
+
+def test_names_of_more_than_32_characters_are_those_of_cantools(tmp_path: Path) -> None:
+    path = tmp_path / "long.dbc"
+    path.write_text(LONG_NAMES)
+    dbc, oracle = both(path)
+    assert list(dbc.messages) == [message.name for message in oracle.messages]
+    assert dbc.messages["A_MESSAGE_OF_MORE_THAN_32_CHARACTERS"].signals.keys() == {
+        *(signal.name for signal in oracle.messages[0].signals)
+    }
+
+
 def test_a_short_message_gives_what_is_there() -> None:
     """Four bytes of TRACK_A: distance and counter, no speed, which begins in byte 5."""
     dbc, _ = both(FOLDER / "opendbc" / "toyota_adas.dbc")

@@ -179,11 +179,22 @@ def test_a_profile_without_sensor_and_ego_is_refused(tmp_path: Path) -> None:
         profile_of(tmp_path, 'description = "nothing"')
 
 
-@pytest.mark.parametrize("dbc", ["", "hello", DBC.replace("16|16@1-", "16|16@x-", 1), "\x00\xff"])
-def test_a_dbc_that_does_not_parse_is_refused_by_one_line(tmp_path: Path, dbc: str) -> None:
-    with pytest.raises(ProfileError, match=r"the DBC .*tiny\.dbc does not parse: ") as refusal:
+@pytest.mark.parametrize("dbc", ["", "hello", "\x00\xff", "BO_TX_BU_ 1 : R;", 'VERSION "BO_"'])
+def test_a_dbc_without_a_message_is_refused(tmp_path: Path, dbc: str) -> None:
+    with pytest.raises(
+        ProfileError, match=r"the DBC .*tiny\.dbc describes no message; is it a DBC"
+    ):
         profile_of(tmp_path, SLOTS, dbc)
-    assert "\n" not in str(refusal.value)
+
+
+def test_a_dbc_that_does_not_parse_is_refused_by_one_line_that_says_where(tmp_path: Path) -> None:
+    lines = ["", 'CM_ "some\nlines";', *DBC.splitlines()]
+    number = next(i for i, line in enumerate(lines) if "16|16@1-" in line)
+    lines[number] = lines[number].replace("16|16@1-", "16|16@x-")
+    place = rf"line {number + 2}, column {lines[number].index('x-') + 1}"
+    with pytest.raises(ProfileError, match=rf"the DBC .*tiny\.dbc does not parse: .*{place}") as no:
+        profile_of(tmp_path, SLOTS, "\n".join(lines))
+    assert "\n" not in str(no.value)
 
 
 def test_a_dbc_with_a_broken_comment_is_used_without_it(tmp_path: Path) -> None:

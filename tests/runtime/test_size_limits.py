@@ -123,24 +123,51 @@ def dbc_with(tmp_path: Path, *, length: str = "8", place: str = "0|8", ranges: s
     return path
 
 
-@pytest.mark.parametrize("length", ["2049", "4000000000", "9" * 5000])
+@pytest.mark.parametrize(
+    "length", ["2049", "4000000000", "9" * 5000, "+4000000000", "// long\n 4000000000"]
+)
 def test_a_dbc_with_an_absurdly_long_message_is_refused(length: str, tmp_path: Path) -> None:
     """cantools would make a text with a digit for each of its bits."""
     with pytest.raises(ProfileError, match=r"the message LONG has .* bytes; no message has more"):
         load_dbc(dbc_with(tmp_path, length=length))
 
 
-@pytest.mark.parametrize("place", ["16385|8", "0|4000000000", f"{'9' * 5000}|8"])
+@pytest.mark.parametrize("place", ["16385|8", "0|4000000000", f"{'9' * 5000}|8", "0\n|-4000000000"])
 def test_a_dbc_with_a_signal_beyond_any_message_is_refused(place: str, tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="the signal FAR lies beyond the 2048 bytes"):
         load_dbc(dbc_with(tmp_path, place=place))
 
 
-@pytest.mark.parametrize("ranges", ["0-4096", "0-2047, 3000 - 5048", "0-99999999999999"])
+@pytest.mark.parametrize(
+    "ranges",
+    [
+        *("0-4096", "0-2047, 3000-5048", "0-99999999999999", "-4000000000-0", f"1-{'9' * 5000}"),
+        *("0+4000000000", "0 // all\n -4000000000"),
+    ],
+)
 def test_a_multiplexer_of_absurdly_many_values_is_refused(ranges: str, tmp_path: Path) -> None:
     """cantools would list every one of them."""
     with pytest.raises(ProfileError, match="values of a multiplexer; no more than 4096 are read"):
         load_dbc(dbc_with(tmp_path, ranges=ranges))
+
+
+def test_what_a_dbc_has_beside_its_layout_is_not_read(tmp_path: Path) -> None:
+    """cantools would write out a number of 100 million digits."""
+    path = dbc_with(tmp_path)
+    path.write_text(
+        path.read_text()
+        + 'BA_DEF_ BO_ "Cycle" INT 0 1;\nBA_DEF_DEF_ "Cycle" "1e99999999";\n'
+        + 'BA_ "Cycle" BO_ 1 1e99999999;\nCM_ BO_ 1 "\nBO_ 2 WORDS: 4000000000 X\n";\n'
+    )
+    assert list(load_dbc(path).messages) == ["LONG"]
+
+
+def test_numbers_may_stand_close_to_words_and_keywords(tmp_path: Path) -> None:
+    """As cantools splits a text."""
+    path = tmp_path / "close.dbc"
+    path.write_text("BS_:250BO_ 1 LONG: 8 X\n\nBO_ 51VER: 40000000X\n")
+    with pytest.raises(ProfileError, match="the message VER has 40000000 bytes"):
+        load_dbc(path)
 
 
 def test_what_a_dbc_may_have_at_most_is_read(tmp_path: Path) -> None:

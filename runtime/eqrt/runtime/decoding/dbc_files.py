@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,19 +10,11 @@ from typing import Any
 
 from eqrt.core.errors import ProfileError, in_one_line
 from eqrt.core.files import read_at_most
+from eqrt.runtime.decoding.dbc_layout import layout_of
 from eqrt.runtime.decoding.dbc_tables import Signal
 
 MAX_BYTES = 1 << 21
 """Of a file: eight times the longest that is published of a whole car (266 kB)."""
-MAX_MESSAGE_BYTES = 2048
-"""Of a message: CAN XL's, the longest there are; J1939's have up to 1,785."""
-MAX_MULTIPLEXED = 1 << 12
-"""Values of a multiplexer for which a signal is there: all that 12 bits can have."""
-_MESSAGE = re.compile(r"\bBO_\s+\d+\s+(\w+)\s*:\s*(\d+)")
-_SIGNAL = re.compile(r"\bSG_\s+(\w+)[^:\"\n]*:\s*(\d+)\s*\|\s*(\d+)")
-_MULTIPLEXED = re.compile(r"\bSG_MUL_VAL_[^;]*")
-_RANGE = re.compile(r"\b(\d{1,20})\s*-\s*(\d{1,20})\b")
-_LAYOUT = ("BO_ ", "SG_ ", "SIG_VALTYPE_ ", "SG_MUL_VAL_ ")  # the lines that say where bits lie
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,9 +56,9 @@ def load_dbc(path: Path) -> Dbc:
         text = read_at_most(MAX_BYTES, path).decode("cp1252", "replace")  # the format's encoding
     except OSError as error:
         raise ProfileError(f"cannot read the DBC {path}: {error.strerror or error}") from error
-    _check_counts(text, path)
+    layout = layout_of(text, f"the DBC {path}")
     try:
-        messages = [_message(message) for message in _parsed(dbc.load_string, text, path)]
+        messages = [_message(message) for message in _parsed(dbc.load_string, layout, path)]
     except (KeyError, RecursionError) as error:
         raise ProfileError(
             f"the DBC {path} has a multiplexer that is missing, or stands in its own way"
@@ -76,43 +66,11 @@ def load_dbc(path: Path) -> Dbc:
     return Dbc(path, {message.name: message for message in messages})
 
 
-def _check_counts(text: str, path: Path) -> None:
-    """Raise ProfileError for what cantools would make room for, bit by bit and value by value."""
-    for name, length in _MESSAGE.findall(text):
-        if _exceeds(length, MAX_MESSAGE_BYTES):
-            raise ProfileError(
-                f"the DBC {path}: the message {name[:60]} has {length[:20]} bytes; no message has "
-                f"more than {MAX_MESSAGE_BYTES}"
-            )
-    for name, *place in _SIGNAL.findall(text):
-        if any(_exceeds(bits, 8 * MAX_MESSAGE_BYTES) for bits in place):
-            raise ProfileError(
-                f"the DBC {path}: the signal {name[:60]} lies beyond the {MAX_MESSAGE_BYTES} bytes "
-                "that a message may have"
-            )
-    for line in _MULTIPLEXED.findall(text):
-        count = sum(int(last) - int(first) + 1 for first, last in _RANGE.findall(line))
-        if count > MAX_MULTIPLEXED:
-            raise ProfileError(
-                f"the DBC {path}: {line[:60]!r} lists {count:.3g} values of a multiplexer; no "
-                f"more than {MAX_MULTIPLEXED} are read"
-            )
-
-
-def _exceeds(digits: str, limit: int) -> bool:
-    return len(digits.lstrip("0")) > len(str(limit)) or int(digits[-20:]) > limit
-
-
-def _parsed(parse: Callable[..., Any], text: str, path: Path) -> list[Any]:
-    """What cantools reads; what it cannot read for a comment's sake, it reads without comments."""
+def _parsed(parse: Callable[..., Any], layout: str, path: Path) -> list[Any]:
     try:
         # Not strict: published DBCs have overlapping signals in messages that nobody asks for.
-        return list(parse(text, strict=False).messages)
+        return list(parse(layout, strict=False).messages)
     except Exception as error:  # cantools lets through whatever it stumbles over
-        layout = "\n".join(line for line in text.splitlines() if line.lstrip().startswith(_LAYOUT))
-        with contextlib.suppress(Exception):
-            if messages := list(parse(f'VERSION ""\n\n{layout}\n', strict=False).messages):
-                return messages
         raise ProfileError(f"the DBC {path} does not parse: {in_one_line(error)}") from error
 
 
