@@ -427,6 +427,7 @@ FAULTS: dict[str, tuple[float, Fault, Callable[[str, Heard], AbstractContextMana
     "the sensor falls silent for 3 s": (3.0, sensor_silent, served_in_a_process),
     "the service stands still for 0.5 s": (0.5, service_stopped, served_in_a_process),
     "the service stands still for 3 s": (3.0, service_stopped, served_in_a_process),
+    "the service stands still for 13 s": (13.0, service_stopped, served_in_a_process),
     "the CPU is starved for 5 s": (5.0, hogs, served_in_a_process),
     "the bus is flooded for 5 s": (5.0, flood, served_in_a_process),
     "listeners on the bus are killed for 3 s": (3.0, other_listener_killed, served_in_a_process),

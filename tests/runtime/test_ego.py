@@ -358,6 +358,27 @@ def test_whatever_comes_the_tracker_neither_fails_nor_tells_what_is_not_a_number
                 assert all(map(math.isfinite, told))
 
 
+def test_a_car_that_is_not_heard_of_is_not_taken_to_stand() -> None:
+    """It stood, its speed falls silent, and it drives round a roundabout until it is back."""
+    tracker = EgoTracker()
+    drive_steadily(tracker, speed_mps=0.0, yaw_rate_rad_s=0.001, from_s=0.0, to_s=5.0)
+    value_rad_s = tracker.yaw_rate_bias.value_rad_s
+    for tick in range(1000):
+        tracker.motion(EgoMotion(timestamp_s=5.02 + 0.02 * tick, yaw_rate_rad_s=0.04))
+    assert tracker.yaw_rate_bias.value_rad_s == value_rad_s
+    drive_steadily(tracker, speed_mps=0.0, yaw_rate_rad_s=0.001, from_s=25.02, to_s=30.0)
+    assert tracker.yaw_rate_bias.value_rad_s == pytest.approx(0.001, abs=1e-4)
+
+
+def test_the_bias_is_learned_from_speeds_of_twice_a_second() -> None:
+    tracker = EgoTracker()
+    for tick in range(1500):
+        speed = 0.0 if tick % 25 == 0 else None
+        motion = EgoMotion(timestamp_s=0.02 * tick, speed_mps=speed, yaw_rate_rad_s=-0.007)
+        tracker.motion(motion)
+    assert tracker.yaw_rate_bias.value_rad_s == pytest.approx(-0.007, abs=1e-4)
+
+
 def test_a_car_on_a_turntable_does_not_spoil_the_bias() -> None:
     tracker = EgoTracker()
     drive_steadily(tracker, speed_mps=0.0, yaw_rate_rad_s=0.2, from_s=0.0, to_s=10.0)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from eqrt.core.errors import AbsentBusError, BusError
-from eqrt.runtime.bus.adapter import Adapter
+from eqrt.runtime.bus.adapter import _MOST_HEARD, Adapter
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.connection import FIRST_RETRY_S, LONGEST_RETRY_S
 from eqrt.runtime.bus.health import BusHealth, BusState, BusWord, in_sum, trouble
@@ -103,6 +103,23 @@ def test_channels_read_in_one_go_come_in_the_order_of_their_times() -> None:
         time.sleep(0.02)  # what was sent has come to both
         heard = [receiver.recv(5.0) for _ in range(20)]
     assert [message.arbitration_id for message in heard if message] == list(range(20))
+    for bus in senders:
+        bus.shutdown()
+
+
+def test_a_busy_channel_beside_a_quiet_one_comes_in_the_order_of_their_times() -> None:
+    """A batch of the quiet one spans ten of the busy one."""
+    names, count = [next(CHANNELS), next(CHANNELS)], 10 * BATCH
+    senders = [open_bus(name, LOCAL) for name in names]
+    wanted: dict[str, Ids | None] = dict.fromkeys(names)
+    with Receiver(opener(LOCAL, fd=None), wanted, never_said) as receiver:
+        wait_for_stamps(receiver, senders[0])
+        for i in range(count):
+            senders[i % 10 == 0].send(number(i))
+        time.sleep(0.02)  # what was sent has come to both
+        heard = [receiver.recv(5.0) for _ in range(count)]
+        assert receiver.recv(0.0) is None
+    assert [value_of(message) for message in heard if message] == list(range(count))
     for bus in senders:
         bus.shutdown()
 
@@ -218,6 +235,57 @@ def test_a_queue_is_made_larger_and_never_smaller() -> None:
         assert after > before or before >= RECEIVE_BYTES
         enlarge(small)
         assert small.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == after
+
+
+@pytest.mark.parametrize("ahead_s", [-1.7e9, -11.0, 0.5, 3600.0])
+def test_a_driver_with_a_clock_of_its_own_is_not_believed(ahead_s: float) -> None:
+    """Some adapters count from when they were plugged in."""
+    heard_s, told_s = stamped(ahead_s)
+    assert heard_s - 1.0 < told_s <= heard_s
+
+
+def test_what_waited_in_a_driver_keeps_its_time() -> None:
+    heard_s, told_s = stamped(-5.0)
+    assert told_s == pytest.approx(heard_s - 5.0, abs=1.0)
+
+
+def stamped(ahead_s: float) -> tuple[float, float]:
+    """When a message stamped by such a clock was heard, and when that is said to have been."""
+    channel = next(CHANNELS)
+    with can.Bus(channel, "virtual", preserve_timestamps=True) as sender:
+        adapter = Adapter(can.Bus(channel, "virtual"), channel)
+        message = number(1)
+        message.timestamp = time.time() + ahead_s
+        sender.send(message)
+        (heard,) = drained(adapter, 1)
+        heard_s = time.time()
+        adapter.shutdown()
+    return heard_s, heard.timestamp
+
+
+def drained(adapter: Adapter, count: int) -> list[can.Message]:
+    """What an adapter gives, once it has so many."""
+    give_up_s = time.monotonic() + PATIENCE_S
+    while len(adapter._heard) < count:
+        assert time.monotonic() < give_up_s
+        time.sleep(0.01)
+    return adapter.read()
+
+
+def test_an_adapter_that_nobody_reads_keeps_the_newest_and_counts_the_rest() -> None:
+    channel, more = next(CHANNELS), 100
+    with open_bus(channel, "virtual") as sender:
+        adapter = Adapter(open_bus(channel, "virtual"), channel)
+        assert adapter.drops() is None
+        for i in range(_MOST_HEARD + more):
+            sender.send(number(i))
+        until_s = time.monotonic() + PATIENCE_S
+        while adapter.drops() != more and time.monotonic() < until_s:
+            time.sleep(0.01)
+        heard = adapter.read()
+        assert adapter.drops() == more
+        adapter.shutdown()
+    assert [value_of(message) for message in heard] == list(range(more, _MOST_HEARD + more))
 
 
 # --- lost and back

@@ -94,9 +94,30 @@ def test_a_wall_clock_that_is_set_again_and_again_is_not_remembered_for_ever() -
     assert waited == pytest.approx(1049.5, abs=1e-6)
 
 
-@pytest.mark.parametrize("stamp_s", [0.0, 1234.5, WALL_S - MAX_QUEUED_S - 1.0, WALL_S + 0.5])
-def test_a_stamp_of_another_clock_means_now(stamp_s: float) -> None:
-    """Some adapters count from when they were plugged in."""
+@pytest.mark.parametrize("waited_s", [MAX_QUEUED_S + 1.0, 60.0, 3600.0])
+def test_messages_that_waited_very_long_are_as_old_as_they_are(waited_s: float) -> None:
+    """While a debugger held the service up, say, or the machine was suspended."""
+    clock = ArrivalClock()
+    clock.now_s(50.0, None, WALL_S)
+    now_s = 50.0 + waited_s
+    told = [clock.now_s(now_s, WALL_S + k / 10, WALL_S + waited_s) for k in range(10)]
+    np.testing.assert_allclose(told, 50.0 + np.arange(10) / 10, atol=1e-6)
+
+
+@pytest.mark.parametrize("set_by_s", [3600.0, -3600.0])
+def test_messages_that_waited_very_long_while_the_clock_was_set_are_not_new(
+    set_by_s: float,
+) -> None:
+    """How old they are can no longer be known: as old as can be."""
+    clock = ArrivalClock()
+    clock.now_s(50.0, None, WALL_S)
+    told = [clock.now_s(80.0, WALL_S + k, WALL_S + 30.0 + set_by_s) for k in range(3)]
+    assert told == [50.0, 50.0, 50.0]
+    assert clock.now_s(80.0, None, WALL_S + 30.0 + set_by_s) == 80.0
+
+
+@pytest.mark.parametrize("stamp_s", [0.0, WALL_S - MAX_QUEUED_S - 1.0, WALL_S + 0.5])
+def test_the_first_of_all_messages_has_not_waited(stamp_s: float) -> None:
     assert ArrivalClock().now_s(50.0, stamp_s, WALL_S) == 50.0
 
 

@@ -17,7 +17,9 @@ from eqrt.runtime.status_book import Channels, StatusBook
 
 _NAP_S = 0.01  # the longest wait for a message: unfinished cycles are closed that promptly
 _REPORT_S = 1.0
-MAX_QUEUED_S = 10.0  # a longer wait is not a queue, but another clock
+MAX_QUEUED_S = 10.0
+"""A message hardly waits longer: what seems to have was perhaps stamped before the wall clock was
+set."""
 _SET_S = 0.05  # a wall clock that moves by more was set; NTP slews by less than 1 ms a second
 _ROUNDED_S = 1e-3  # by which a stamp may lie ahead of now, because it has a coarser clock
 _TOGETHER_S = 1e-3  # two looks at a clock take some 0.1 us, where each is a system call 60 us
@@ -158,8 +160,8 @@ class ArrivalClock:
     Messages wait in the driver's queue while the service is busy. Their stamps (wall clock) tell
     how long, and the pipeline's time follows them, so that a queue full of messages does not look
     like a bus that has fallen silent. Where the wall clock was set meanwhile, those that were
-    stamped before are read by the clock as it was then. A stamp that is not from the last seconds
-    by any clock is another clock's and says nothing. The time told never goes back.
+    stamped before are read by the clock as it was then. Who was held up for longer than is
+    remembered of it takes messages for old rather than for new. The time told never goes back.
     """
 
     def __init__(self) -> None:
@@ -196,8 +198,13 @@ class ArrivalClock:
             for wall in self._walls
             if -_ROUNDED_S <= monotonic_s - (arrived_s := stamp_s - wall.ahead_s) <= MAX_QUEUED_S
         ]
-        in_order_s = (arrived_s for arrived_s in possible_s if arrived_s >= self._told_s)
-        return next(in_order_s, possible_s[0] if possible_s else monotonic_s)
+        if possible_s:
+            in_order_s = (arrived_s for arrived_s in possible_s if arrived_s >= self._told_s)
+            return next(in_order_s, possible_s[0])
+        if self._told_s == -math.inf:
+            return monotonic_s  # the first of all: it has not waited
+        arrived_s = stamp_s - self._walls[0].ahead_s
+        return arrived_s if arrived_s < monotonic_s else self._told_s
 
 
 @dataclass(slots=True)

@@ -29,8 +29,8 @@ class Link(Protocol):
     def read(self) -> list[can.Message]:
         """What has come, oldest first, perhaps not all of it; empty if nothing has. Never waits.
 
-        Raises OSError or can.CanError if the channel can no longer be read, perhaps before all
-        that waits was.
+        Stamped by this machine's wall clock. Raises OSError or can.CanError if the channel can no
+        longer be read, perhaps before all that waits was.
         """
 
     def send(self, msg: can.Message) -> None:

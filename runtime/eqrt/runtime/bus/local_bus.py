@@ -22,7 +22,13 @@ from typing import Any
 import can
 
 from eqrt.runtime.bus.ids import Ids
-from eqrt.runtime.bus.kernel_queue import RECEIVE_BYTES, SENDER_BYTES, KernelQueue, enlarge
+from eqrt.runtime.bus.kernel_queue import (
+    RECEIVE_BYTES,
+    SENDER_BYTES,
+    Arrival,
+    KernelQueue,
+    enlarge,
+)
 
 PORT = 43114
 _HEADER = struct.Struct("<8sIBBxx")  # channel digest, id and its flags, length, CAN FD flags
@@ -173,9 +179,16 @@ class LocalReader:
 
         Raises OSError if the bus can no longer be read.
         """
+        messages: list[can.Message] = []
+        while not messages and (arrivals := self._queue.read()):
+            messages = self._ours(arrivals)
+        return messages
+
+    def _ours(self, arrivals: list[Arrival]) -> list[can.Message]:
+        """Without what this sent itself, and what other channels sent to the same group."""
         buffer, senders, channel = self._queue.buffer, self._queue.senders, str(self._bus.channel)
         messages = []
-        for i, (start, length, arrived_s) in enumerate(self._queue.read()):
+        for i, (start, length, arrived_s) in enumerate(arrivals):
             sender = senders[i * SENDER_BYTES + 2 : i * SENDER_BYTES + 8]  # its port and address
             datagram = buffer[start : start + length]
             if sender != self._own and datagram[:8] == self._digest and self._wants(datagram):

@@ -16,7 +16,10 @@ import can
 from eqrt.runtime.bus.connection import Connection
 from eqrt.runtime.bus.health import BusHealth, BusState, BusWord
 from eqrt.runtime.bus.ids import Ids
+from eqrt.runtime.bus.kernel_queue import BATCH
 from eqrt.runtime.bus.links import OpenLink
+
+_MOST_AT_ONCE = 50_000  # messages; more than the queues of several channels hold
 
 
 class Receiver:
@@ -66,12 +69,24 @@ class Receiver:
                 return
 
     def _read(self, wait_s: float) -> None:
-        """One batch of each channel that has something, after waiting for the first."""
+        """What each channel has, after waiting for the first."""
         ready = self._selector.select(None if wait_s == math.inf else wait_s)
-        batches = [key.data.read() for key, _ in ready]
+        heard: dict[str, list[can.Message]] = {channel: [] for channel in self._connections}
+        total = 0
+        while ready:
+            batches = [(key.data.channel, key.data.read()) for key, _ in ready]
+            for channel, batch in batches:
+                heard[channel] += batch
+            count = sum(len(batch) for _, batch in batches)
+            total += count
+            # A batch of a busy channel reaches less far than one of a quiet channel: both are read
+            # to their ends, but for the few messages that came meanwhile.
+            if len(self._connections) == 1 or count < BATCH or total > _MOST_AT_ONCE:
+                break
+            ready = self._selector.select(0.0)
         # Channels that were read one after the other spoke at the same time. Merged, not sorted:
         # where the wall clock was set back meanwhile, each channel keeps its own order.
-        self._pending.extend(heapq.merge(*batches, key=attrgetter("timestamp")))
+        self._pending.extend(heapq.merge(*heard.values(), key=attrgetter("timestamp")))
 
     def connection(self, channel: str) -> Connection:
         """What sends on a channel, whether or not it is there at the moment."""

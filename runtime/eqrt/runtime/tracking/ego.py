@@ -94,13 +94,13 @@ class EgoTracker:
         restarts = self._odometry.restarts
         if speed is not None and self._is_possible(timestamp_s, speed, _MAX_SPEED_MPS):
             self._count(self._odometry.add_speed(timestamp_s, speed))
-            self._standstill.add_speed(timestamp_s, speed)
-        if yaw_rate is not None and self._is_possible(timestamp_s, yaw_rate, _MAX_YAW_RATE_RAD_S):
-            self._count(self._odometry.add_yaw_rate(timestamp_s, yaw_rate))
-            rest = self._standstill.add_yaw_rate(timestamp_s, yaw_rate)
+            rest = self._standstill.add_speed(timestamp_s, speed)
             if rest is not None:
                 self.yaw_rate_bias.observe_standstill(*rest)
                 self._use_calibration()
+        if yaw_rate is not None and self._is_possible(timestamp_s, yaw_rate, _MAX_YAW_RATE_RAD_S):
+            self._count(self._odometry.add_yaw_rate(timestamp_s, yaw_rate))
+            self._standstill.add_yaw_rate(yaw_rate)
         if self._odometry.restarts > restarts:
             self._cut(None)
         if self._map_from_odometry is None:

@@ -152,38 +152,45 @@ class SpeedScale:
 
 
 class Standstill:
-    """The mean yaw rate of every second in which the car has stood for a second already."""
+    """The mean yaw rate of every second in which the car has stood for a second already.
+
+    That it stood is known between two speeds that say so, and not after the last one.
+    """
 
     _MAX_SPEED_MPS = 0.1
+    _MAX_GAP_S = 1.0  # between two speeds; a car that is not heard of for longer may have moved
     _SPAN_S = 1.0
 
     def __init__(self) -> None:
         self._since_s: float | None = None
         """Start of the second, the first of which is for coming to rest; None = driving."""
+        self._heard_s = -math.inf
+        """Time of the last speed."""
         self._at_rest = False
         self._sum_rad_s = 0.0
         self._count = 0
 
-    def add_speed(self, timestamp_s: float, speed_mps: float) -> None:
-        """One measured speed."""
+    def add_speed(self, timestamp_s: float, speed_mps: float) -> tuple[float, float] | None:
+        """One measured speed; (mean rad/s, span s) when it completes a second at rest."""
+        gap_s, self._heard_s = timestamp_s - self._heard_s, timestamp_s
         if abs(speed_mps) > self._MAX_SPEED_MPS:
-            self._since_s, self._at_rest = None, False
-        elif self._since_s is None:
-            self._begin(timestamp_s)
-
-    def add_yaw_rate(self, timestamp_s: float, yaw_rate_rad_s: float) -> tuple[float, float] | None:
-        """One measured yaw rate; (mean rad/s, span s) when it completes a second at rest."""
-        if self._since_s is None:
+            self._since_s = None
             return None
-        self._sum_rad_s += yaw_rate_rad_s
-        self._count += 1
+        if self._since_s is None or not 0.0 <= gap_s <= self._MAX_GAP_S:
+            self._begin(timestamp_s, at_rest=False)
+            return None
         span_s = timestamp_s - self._since_s
-        if 0.0 <= span_s < self._SPAN_S:
+        if span_s < self._SPAN_S:
             return None
-        mean_rad_s, at_rest = self._sum_rad_s / self._count, self._at_rest and span_s > 0.0
-        self._begin(timestamp_s)
-        self._at_rest = True
+        mean_rad_s, at_rest = self._sum_rad_s / max(1, self._count), self._at_rest and self._count
+        self._begin(timestamp_s, at_rest=True)
         return (mean_rad_s, span_s) if at_rest else None
 
-    def _begin(self, timestamp_s: float) -> None:
-        self._since_s, self._sum_rad_s, self._count = timestamp_s, 0.0, 0
+    def add_yaw_rate(self, yaw_rate_rad_s: float) -> None:
+        """One measured yaw rate, not older than the last speed."""
+        self._sum_rad_s += yaw_rate_rad_s
+        self._count += 1
+
+    def _begin(self, timestamp_s: float, *, at_rest: bool) -> None:
+        self._since_s, self._at_rest = timestamp_s, at_rest
+        self._sum_rad_s, self._count = 0.0, 0
