@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
 
-from can_recordings import detections_of
+from can_recordings import detections_of, feed_all
 from eqrt.runtime.decoding.can_io import Decoder
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 from tiny_sensor import (
@@ -27,6 +28,14 @@ from tiny_sensor import (
 )
 
 NAN = math.nan
+
+
+def stamped(messages: list[can.Message], step_s: float) -> list[can.Message]:
+    """The messages, one every step from 0 s on."""
+    again = [copy(one) for one in messages]
+    for i, one in enumerate(again):
+        one.timestamp = i * step_s
+    return again
 
 
 def feed(decoder: Decoder, messages: list[can.Message], at_s: float = 0.0) -> list[Detections]:
@@ -87,10 +96,28 @@ class TestCounted:
     def test_a_timeout_closes_an_unfinished_cycle(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTED)
         feed(decoder, [header(2), first(10, 0, 7)])
-        assert decoder.poll(0.099) == []
-        (cycle,) = detections_of(decoder.poll(0.101))
+        assert decoder.poll(0.1) == []
+        (cycle,) = detections_of(decoder.poll(0.102))
         assert not cycle.complete
+        assert (cycle.timestamp_s, cycle.received_s) == (0.0, 0.001)
         assert decoder.poll(0.2) == []
+
+    def test_a_cycle_may_take_longer_than_the_timeout(self, tmp_path: Path) -> None:
+        """Its messages come 90 ms apart, and the timeout is 100 ms."""
+        decoder = decoder_of(tmp_path, COUNTED)
+        messages = [header(2), first(10, 0, 7), first(20, 0, 8), second(7, 4.5), second(8, 12.0)]
+        events = feed_all(decoder, stamped(messages, 0.09))
+        (cycle,) = detections_of(events)
+        assert cycle.complete
+        assert (cycle.timestamp_s, cycle.received_s) == (0.0, 0.36)
+        assert cycle.object_id.tolist() == [7, 8]
+
+    def test_messages_beyond_its_count_do_not_keep_a_cycle_open(self, tmp_path: Path) -> None:
+        decoder = decoder_of(tmp_path, COUNTED)
+        feed(decoder, [header(1), first(10, 0, 7)])
+        (cycle,) = detections_of(feed_all(decoder, stamped([first(30, 0, 9)] * 5, 0.03)))
+        assert cycle.object_id.tolist() == [7]
+        assert decoder.counters.stray == 5
 
     def test_a_late_message_closes_an_unfinished_cycle_and_is_none_of_it(
         self, tmp_path: Path

@@ -95,9 +95,16 @@ class Framing(ABC):
         return closed if self._missing else closed + self._close(complete=True)
 
     def expire(self, now_s: float) -> tuple[Cycle, ...]:
-        """Close a cycle older than the timeout, or one from before the clock was set back."""
-        timeout_s = self._sensor.timeout_s
-        if not self._is_open or -timeout_s <= now_s - self._first_s <= timeout_s:
+        """Close a cycle that has waited too long, or one from before the clock was set back.
+
+        That is `timeout_s` after its last message, because the more objects there are, the longer
+        a cycle takes; and `silence_s` after its first one, because the sensor is silent then.
+        """
+        sensor = self._sensor
+        if not self._is_open or (
+            -sensor.timeout_s <= now_s - self._last_s <= sensor.timeout_s
+            and -sensor.silence_s <= now_s - self._first_s <= sensor.silence_s
+        ):
             return ()
         return self._close(complete=False)
 
