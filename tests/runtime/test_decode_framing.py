@@ -228,6 +228,30 @@ class TestOptionalMessages:
         (cycle,) = feed(decoder, self.cycle(10, second(7, 4.5)), at_s=10.0)
         assert cycle.length_m.tolist() == [4.5]
 
+    @pytest.mark.parametrize("period_s", [0.05, 0.2])
+    @pytest.mark.parametrize("places", [[0, 1, 2, 3, 4, 5, 6, 7], [0, 4, 1, 5, 2, 6, 3, 7]])
+    def test_slots_that_come_after_all_are_waited_for_again(
+        self, tmp_path: Path, places: list[int], period_s: float
+    ) -> None:
+        """Behind the first messages or between them; they make no cycles of their own."""
+        optional = SLOTS.replace(
+            '"SECOND_{slot:X}"', '{ message = "SECOND_{slot:X}", optional = true }'
+        )
+        decoder, cycles = decoder_of(tmp_path, optional), []
+        for i in range(7):
+            whole = [first(slot + 1, 0, 0, slot=slot, counter=i) for slot in range(4)]
+            whole += [second(0, 4.5, slot=slot) for slot in range(4)]
+            sent = whole[:4] if i < 4 else [whole[place] for place in places]
+            decoder.poll(i * period_s)
+            cycles += feed(decoder, sent, at_s=i * period_s)
+        *_, late, one, another = cycles
+        assert late.complete
+        assert math.isnan(late.length_m[3])
+        assert one.length_m.tolist() == another.length_m.tolist() == [4.5] * 4
+        counters = decoder.counters
+        assert (counters.cycles, counters.incomplete_cycles) == (7, 3)
+        assert counters.stray == np.isnan(late.length_m).sum()
+
 
 class TestCounters:
     def test_a_lost_cycle_is_counted(self, tmp_path: Path) -> None:

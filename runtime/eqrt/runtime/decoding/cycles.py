@@ -213,7 +213,8 @@ class CountedFraming(Framing):
 class SlotFraming(Framing):
     """One message id per slot and part; a slot that comes twice begins the next cycle.
 
-    With a header, only a header begins a cycle. `single` framing is that of one slot.
+    With a header, only a header begins a cycle; without, any message of the parts that the one
+    before waited for. `single` framing is that of one slot.
     """
 
     def add(
@@ -228,7 +229,7 @@ class SlotFraming(Framing):
         if self._is_open and self._payloads[part][slot] is not None:
             closed = self._close(complete=False)
         if not self._is_open:
-            if self._sensor.header is not None:
+            if self._sensor.header is not None or not self._awaited[part]:
                 self._stray(part)
                 return closed
             self._begin(None, None, timestamp_s)
