@@ -167,7 +167,7 @@ def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
         ),
         (
             "ars408",
-            "timeout_s = 0.05 ",
+            "timeout_s = 0.03 ",
             "timeout_s = 0.0005 ",
             r"ars408: \d+ of 2001 cycles are incomplete: .*timeout_s is too short",
         ),

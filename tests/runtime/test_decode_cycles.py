@@ -69,12 +69,28 @@ def test_what_is_not_awaited_any_more_still_belongs_to_the_cycle_it_comes_in(
     assert cycle.length_m.tolist() == [4.5]
 
 
+EXACT = COUNTED.replace("timeout_s = 0.1", "timeout_s = 0.125\nsilence_s = 0.1875")
+"""Numbers that a float holds exactly."""
+
+
 @pytest.mark.parametrize("since_s", [0.125, -0.125])
-def test_a_cycle_just_as_old_as_the_timeout_stays_open(tmp_path: Path, since_s: float) -> None:
-    """Numbers that a float holds exactly."""
-    exact = COUNTED.replace("timeout_s = 0.1", "timeout_s = 0.125")
-    decoder = decoder_of(tmp_path, exact)
+def test_a_cycle_whose_last_message_is_as_old_as_the_timeout_stays_open(
+    tmp_path: Path, since_s: float
+) -> None:
+    decoder = decoder_of(tmp_path, EXACT)
+    decoder.feed(header(1), 1.0 - since_s / 4)
+    decoder.feed(first(10, 0, 7), 1.0)
+    assert decoder.poll(1.0 + since_s) == []
+    assert len(decoder.poll(1.0 + since_s * 1.001)) == 1
+
+
+@pytest.mark.parametrize("since_s", [0.1875, -0.1875])
+def test_a_cycle_as_old_as_silence_stays_open_if_its_messages_still_come(
+    tmp_path: Path, since_s: float
+) -> None:
+    decoder = decoder_of(tmp_path, EXACT)
     decoder.feed(header(1), 1.0)
+    decoder.feed(first(10, 0, 7), 1.0 + since_s / 2)
     assert decoder.poll(1.0 + since_s) == []
     assert len(decoder.poll(1.0 + since_s * 1.001)) == 1
 
@@ -189,6 +205,18 @@ def test_old_messages_of_a_slot_that_has_come_count_as_wrong_ones(
     (cycle,) = (one for place in others for one in gathering.add(*place, b"0", 0.0, Status.OK))
     assert cycle.payloads == [[b"0"] * 4] * 2
     assert (cycle.num_messages, cycle.num_wrong) == (8 + len(stale), len(stale))
+
+
+@pytest.mark.parametrize("text", [COUNTED, SLOTS])
+@pytest.mark.parametrize("stale", STALE)
+def test_old_messages_do_not_keep_a_cycle_open(tmp_path: Path, stale: Status, text: str) -> None:
+    gathering = framing(tmp_path, text)
+    if text is COUNTED:
+        gathering.open(bytes([1, 0, 0, 0]), 0.0, Status.OK)
+    assert gathering.add(0, 0, b"first", 0.0, Status.OK) == ()
+    assert gathering.add(0, 0, b"first", 0.09, stale) == ()
+    (cycle,) = gathering.expire(0.11)
+    assert cycle.last_s == 0.0
 
 
 @pytest.mark.parametrize("status", [Status.ERROR, Status.SOME_LOST])

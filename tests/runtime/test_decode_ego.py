@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import eqrt.runtime.decoding.profile
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
+from eqrt.runtime.decoding.generic_objects import ListProtection, encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from tiny_sensor import DBC, EGO, GEAR, decoder_of, message, profile_of
 
@@ -204,11 +207,15 @@ def test_only_places_on_earth_are_told(
     assert len(told) == is_place
 
 
+@cache
+def sbg_dbc() -> Any:
+    return cantools.database.load_file(SBG_DBC)
+
+
 def sbg_messages(
     latitude_deg: float, longitude_deg: float, heading_rad: float
 ) -> list[can.Message]:
     """What the INS sends of a fix that is good to 10 cm, from its published DBC."""
-    database: Any = cantools.database.load_file(SBG_DBC)
     values = {
         "SBG_ECAN_MSG_EKF_EULER": {"ROLL": 0, "PITCH": 0, "YAW": heading_rad},
         "SBG_ECAN_MSG_EKF_POS": {"LATITUDE": latitude_deg, "LONGITUDE": longitude_deg},
@@ -216,7 +223,7 @@ def sbg_messages(
             ("LATITUDE_ACC", "LONGITUDE_ACC", "ALTITUDE_ACC"), 0.1
         ),
     }
-    definitions = [(database.get_message_by_name(name), value) for name, value in values.items()]
+    definitions = [(sbg_dbc().get_message_by_name(name), value) for name, value in values.items()]
     return [message(d.frame_id, d.encode(value)) for d, value in definitions]
 
 
@@ -286,3 +293,92 @@ def test_the_map_may_get_another_origin_under_way() -> None:
 
 def test_an_origin_is_of_no_use_to_poses_that_are_in_the_map_already() -> None:
     assert not Decoder(load_profile("generic")).set_map_origin((49.0, 8.4))
+
+
+APART = """
+description = "a pose in two messages, with a yaw rate in the first"
+
+[[ego]]
+bus = "car"
+dbc = "tiny.dbc"
+messages = { place = "EGO", yaw = "GEAR" }
+hold_s = 1.0
+
+[ego.fields]
+x = { signal = "place.LEFT", unit = "m" }
+y = { signal = "place.RIGHT", unit = "m" }
+yaw = { signal = "yaw.GEAR", unit = "deg" }
+yaw_rate = "place.YAW_RATE"
+valid = "yaw.GEAR < 200"
+"""
+
+
+def of_poses(folder: Path, *messages: can.Message) -> list[tuple[float, float]]:
+    """When the poses were that the messages tell, 10 ms apart from 0 s on, and their x in m."""
+    decoder = decoder_of(folder, APART)
+    events = [event for i, one in enumerate(messages) for event in decoder.feed(one, i / 100)]
+    poses = [event for event in events if isinstance(event, EgoPose)]
+    return [(pose.timestamp_s, pose.map_from_ego.x_m) for pose in poses]
+
+
+def test_a_place_counts_for_one_pose(tmp_path: Path) -> None:
+    """Yaws come twice as often as places."""
+    yaw = message(GEAR, bytes([90]))
+    messages = [ego(1.0, 0.0), yaw, yaw, ego(2.0, 0.0), yaw, yaw]
+    assert of_poses(tmp_path, *messages) == [(0.01, 1.0), (0.04, 2.0)]
+
+
+def test_a_place_that_was_not_valid_makes_no_pose_of_a_later_time(tmp_path: Path) -> None:
+    invalid, yaw = message(GEAR, bytes([200])), message(GEAR, bytes([90]))
+    messages = [ego(1.0, 0.0), invalid, yaw, ego(2.0, 0.0), yaw]
+    assert of_poses(tmp_path, *messages) == [(0.04, 2.0)]
+
+
+def test_what_is_no_pose_is_held_all_the_same(tmp_path: Path) -> None:
+    """Of the message with the place, only that counts once: the yaw rate is told three times."""
+    decoder = decoder_of(tmp_path, APART)
+    decoder.feed(ego(1.0, 0.0, 9.0), 0.0)
+    told = [decoder.feed(message(GEAR, bytes([90])), at_s) for at_s in (0.25, 0.5, 1.0, 1.25)]
+    assert [[type(event) for event in events] for events in told] == [
+        [EgoMotion, EgoPose],
+        [EgoMotion],
+        [EgoMotion],
+        [],
+    ]
+
+
+NUM_POSES, PERIOD_S, SPEED_MPS = 4, 0.02, 30.0
+
+
+def sent_poses(profile: str) -> list[can.Message]:
+    """Poses of a car on its way east from the map's origin."""
+    protection = ListProtection() if profile == "generic-e2e" else None
+    messages = []
+    for i in range(NUM_POSES):
+        x_m, timestamp_s = i * SPEED_MPS * PERIOD_S, i * PERIOD_S
+        if profile == "sbg-ins":
+            one = sbg_messages(0.0, math.degrees(x_m / 6378137.0), heading_rad=math.pi / 2)
+        else:
+            one = encode_cycle(
+                timestamp_s=timestamp_s, map_from_ego=Pose2(x_m, 0.0, 0.0), protection=protection
+            )
+        for place, part in enumerate(one):
+            part.timestamp = timestamp_s + 0.0003 * place
+        messages += one
+    return messages
+
+
+@pytest.mark.parametrize("profile", ["generic", "generic-e2e", "sbg-ins"])
+def test_a_pose_is_true_whatever_was_lost(profile: str) -> None:
+    """Each message alone, and whatever lies between two of them."""
+    known, messages = load_profile(profile), sent_poses(profile)
+    per_pose = len(messages) // NUM_POSES
+    for begin, end in combinations(range(len(messages) + 1), 2):
+        decoder = Decoder(known, map_origin_deg=(0.0, 0.0))
+        left = messages[:begin] + messages[end:]
+        events = [event for one in left for event in decoder.feed(one, one.timestamp)]
+        poses = [event for event in events if isinstance(event, EgoPose)]
+        assert len(poses) == begin // per_pose + (len(messages) - end) // per_pose
+        for pose in poses:
+            true_m = SPEED_MPS * PERIOD_S * round(pose.timestamp_s / PERIOD_S)
+            assert pose.map_from_ego.x_m == pytest.approx(true_m, abs=0.02)

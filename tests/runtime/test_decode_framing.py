@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
 
-from can_recordings import detections_of
+from can_recordings import detections_of, feed_all
 from eqrt.runtime.decoding.can_io import Decoder
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 from tiny_sensor import (
@@ -27,6 +28,14 @@ from tiny_sensor import (
 )
 
 NAN = math.nan
+
+
+def stamped(messages: list[can.Message], step_s: float) -> list[can.Message]:
+    """The messages, one every step from 0 s on."""
+    again = [copy(one) for one in messages]
+    for i, one in enumerate(again):
+        one.timestamp = i * step_s
+    return again
 
 
 def feed(decoder: Decoder, messages: list[can.Message], at_s: float = 0.0) -> list[Detections]:
@@ -87,10 +96,28 @@ class TestCounted:
     def test_a_timeout_closes_an_unfinished_cycle(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTED)
         feed(decoder, [header(2), first(10, 0, 7)])
-        assert decoder.poll(0.099) == []
-        (cycle,) = detections_of(decoder.poll(0.101))
+        assert decoder.poll(0.1) == []
+        (cycle,) = detections_of(decoder.poll(0.102))
         assert not cycle.complete
+        assert (cycle.timestamp_s, cycle.received_s) == (0.0, 0.001)
         assert decoder.poll(0.2) == []
+
+    def test_a_cycle_may_take_longer_than_the_timeout(self, tmp_path: Path) -> None:
+        """Its messages come 90 ms apart, and the timeout is 100 ms."""
+        decoder = decoder_of(tmp_path, COUNTED)
+        messages = [header(2), first(10, 0, 7), first(20, 0, 8), second(7, 4.5), second(8, 12.0)]
+        events = feed_all(decoder, stamped(messages, 0.09))
+        (cycle,) = detections_of(events)
+        assert cycle.complete
+        assert (cycle.timestamp_s, cycle.received_s) == (0.0, 0.36)
+        assert cycle.object_id.tolist() == [7, 8]
+
+    def test_messages_beyond_its_count_do_not_keep_a_cycle_open(self, tmp_path: Path) -> None:
+        decoder = decoder_of(tmp_path, COUNTED)
+        feed(decoder, [header(1), first(10, 0, 7)])
+        (cycle,) = detections_of(feed_all(decoder, stamped([first(30, 0, 9)] * 5, 0.03)))
+        assert cycle.object_id.tolist() == [7]
+        assert decoder.counters.stray == 5
 
     def test_a_late_message_closes_an_unfinished_cycle_and_is_none_of_it(
         self, tmp_path: Path
@@ -200,6 +227,30 @@ class TestOptionalMessages:
             assert len(feed(decoder, [header(0, i)], at_s=float(i))) == 1
         (cycle,) = feed(decoder, self.cycle(10, second(7, 4.5)), at_s=10.0)
         assert cycle.length_m.tolist() == [4.5]
+
+    @pytest.mark.parametrize("period_s", [0.05, 0.2])
+    @pytest.mark.parametrize("places", [[0, 1, 2, 3, 4, 5, 6, 7], [0, 4, 1, 5, 2, 6, 3, 7]])
+    def test_slots_that_come_after_all_are_waited_for_again(
+        self, tmp_path: Path, places: list[int], period_s: float
+    ) -> None:
+        """Behind the first messages or between them; they make no cycles of their own."""
+        optional = SLOTS.replace(
+            '"SECOND_{slot:X}"', '{ message = "SECOND_{slot:X}", optional = true }'
+        )
+        decoder, cycles = decoder_of(tmp_path, optional), []
+        for i in range(7):
+            whole = [first(slot + 1, 0, 0, slot=slot, counter=i) for slot in range(4)]
+            whole += [second(0, 4.5, slot=slot) for slot in range(4)]
+            sent = whole[:4] if i < 4 else [whole[place] for place in places]
+            decoder.poll(i * period_s)
+            cycles += feed(decoder, sent, at_s=i * period_s)
+        *_, late, one, another = cycles
+        assert late.complete
+        assert math.isnan(late.length_m[3])
+        assert one.length_m.tolist() == another.length_m.tolist() == [4.5] * 4
+        counters = decoder.counters
+        assert (counters.cycles, counters.incomplete_cycles) == (7, 3)
+        assert counters.stray == np.isnan(late.length_m).sum()
 
 
 class TestCounters:

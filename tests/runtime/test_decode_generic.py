@@ -188,9 +188,9 @@ def test_a_pose_whose_first_half_is_old_is_not_told() -> None:
     decoder = Decoder(PROFILE)
     position, yaw = encode_cycle(timestamp_s=0.0, map_from_ego=Pose2(1.0, 2.0, 3.0))
     assert decoder.feed(position, 10.0) == []
-    assert decoder.feed(yaw, 10.1) == []
+    assert decoder.feed(yaw, 10.03) == []
     decoder.feed(position, 10.2)
-    assert len(decoder.feed(yaw, 10.24)) == 1
+    assert len(decoder.feed(yaw, 10.21)) == 1
 
 
 def test_a_pose_of_no_quality_is_not_told() -> None:

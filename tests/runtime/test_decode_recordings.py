@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -85,6 +87,58 @@ def test_an_ars408_cycle_is_closed_by_its_last_message(ars408: Decoded) -> None:
     cycles = ars408.cycles
     assert max(cycle.received_s - cycle.timestamp_s for cycle in cycles) < 0.009
     assert min(np.diff([cycle.timestamp_s for cycle in cycles])) > 0.065
+
+
+def crowded_ars408(step_s: float, period_s: float, lost: int | None = None) -> list[can.Message]:
+    """The recording's first cycle with its object a hundred times, in 301 messages, four times."""
+    recorded = messages_of("ars408")
+    header, *parts = (
+        next(one for one in recorded if one.arbitration_id == each) for each in range(0x60A, 0x60E)
+    )
+    messages = []
+    for cycle in range(4):
+        opening = bytes([100, 0, cycle, *header.data[3:]])
+        bodies = [(part, bytes([i, *part.data[1:]])) for part in parts for i in range(100)]
+        for place, (one, data) in enumerate([(header, opening), *bodies]):
+            again = copy(one)
+            again.data, again.timestamp = bytearray(data), cycle * period_s + place * step_s
+            messages += [again] if place != lost else []
+    return messages
+
+
+@pytest.mark.parametrize("step_s", [0.00022, 0.00027])
+def test_a_crowded_ars408_list_is_complete_however_long_it_takes(step_s: float) -> None:
+    """Messages of 111 to 135 bits at 500 kbit/s: 67 to 81 ms."""
+    decoder = Decoder(load_profile("ars408"))
+    cycles = detections_of(feed_all(decoder, crowded_ars408(step_s, 0.09)))
+    assert len(cycles) == 4
+    for i, cycle in enumerate(cycles):
+        assert cycle.complete
+        assert cycle.object_id.tolist() == list(range(100))
+        assert (cycle.object_class == ObjectClass.CAR).all()
+        assert cycle.timestamp_s == pytest.approx(0.09 * i)
+        assert cycle.received_s == pytest.approx(0.09 * i + 300 * step_s)
+    assert (decoder.counters.incomplete_cycles, decoder.counters.stray) == (0, 0)
+
+
+@pytest.mark.parametrize(("period_s", "told_s"), [(0.08, 0.08), (0.2, 0.105)])
+def test_a_crowded_ars408_list_without_its_last_message_is_told_soon(
+    period_s: float, told_s: float
+) -> None:
+    """With the next header, or 30 ms after the last message; and it is as old as its header."""
+    decoder, waiting = Decoder(load_profile("ars408")), crowded_ars408(0.00025, period_s, lost=300)
+    cycles: list[Detections] = []
+    now_s = 0.0
+    while not cycles:
+        now_s += 0.001
+        while waiting[0].timestamp < now_s:
+            one = waiting.pop(0)
+            cycles += detections_of(decoder.feed(one, one.timestamp))
+        cycles += detections_of(decoder.poll(now_s))
+    assert now_s == pytest.approx(told_s, abs=0.0011)
+    (cycle,) = cycles
+    assert (cycle.complete, cycle.timestamp_s) == (False, 0.0)
+    assert np.flatnonzero(cycle.object_class != ObjectClass.CAR).tolist() == [99]
 
 
 def test_rav4_radar_points_are_those_of_the_dataset(rav4: Decoded) -> None:

@@ -95,9 +95,16 @@ class Framing(ABC):
         return closed if self._missing else closed + self._close(complete=True)
 
     def expire(self, now_s: float) -> tuple[Cycle, ...]:
-        """Close a cycle older than the timeout, or one from before the clock was set back."""
-        timeout_s = self._sensor.timeout_s
-        if not self._is_open or -timeout_s <= now_s - self._first_s <= timeout_s:
+        """Close a cycle that has waited too long, or one from before the clock was set back.
+
+        That is `timeout_s` after its last message, because the more objects there are, the longer
+        a cycle takes; and `silence_s` after its first one, because the sensor is silent then.
+        """
+        sensor = self._sensor
+        if not self._is_open or (
+            -sensor.timeout_s <= now_s - self._last_s <= sensor.timeout_s
+            and -sensor.silence_s <= now_s - self._first_s <= sensor.silence_s
+        ):
             return ()
         return self._close(complete=False)
 
@@ -206,7 +213,8 @@ class CountedFraming(Framing):
 class SlotFraming(Framing):
     """One message id per slot and part; a slot that comes twice begins the next cycle.
 
-    With a header, only a header begins a cycle. `single` framing is that of one slot.
+    With a header, only a header begins a cycle; without, any message of the parts that the one
+    before waited for. `single` framing is that of one slot.
     """
 
     def add(
@@ -221,7 +229,7 @@ class SlotFraming(Framing):
         if self._is_open and self._payloads[part][slot] is not None:
             closed = self._close(complete=False)
         if not self._is_open:
-            if self._sensor.header is not None:
+            if self._sensor.header is not None or not self._awaited[part]:
                 self._stray(part)
                 return closed
             self._begin(None, None, timestamp_s)

@@ -34,7 +34,10 @@ class EgoDecoder:
         self._origin = origin
 
     def add(self, part: int, data: Payload, timestamp_s: float) -> list[EgoMotion | EgoPose]:
-        """Take a message; the last one of the group tells, together with what is still fresh."""
+        """Take a message; the last one of the group tells, together with what is still fresh.
+
+        Of a pose, only what came after the last one before: an old place at a new time is wrong.
+        """
         profile = self._profile
         self._values[part] = [column.read(data) for column in profile.parts[part].columns]
         self._arrived_s[part] = timestamp_s
@@ -43,13 +46,16 @@ class EgoDecoder:
         for other, arrived_s in enumerate(self._arrived_s):
             if not 0.0 <= timestamp_s - arrived_s <= profile.hold_s:
                 self._values[other] = [_NAN] * len(self._values[other])
-        if profile.valid is not None and not profile.valid.holds(self._values):
-            return []
-        age_s = self._number("age") or 0.0
-        return self._told(timestamp_s - profile.latency_s - age_s)
+        events = self._told(timestamp_s)
+        for column in profile.pose_columns:
+            self._values[column.part][column.row] = _NAN
+        return events
 
-    def _told(self, timestamp_s: float) -> list[EgoMotion | EgoPose]:
+    def _told(self, arrived_s: float) -> list[EgoMotion | EgoPose]:
         events: list[EgoMotion | EgoPose] = []
+        if self._profile.valid is not None and not self._profile.valid.holds(self._values):
+            return events
+        timestamp_s = arrived_s - self._profile.latency_s - (self._number("age") or 0.0)
         speed, yaw_rate = self._number("speed"), self._number("yaw_rate")
         if speed is not None and self._profile.reverse is not None:
             speed = -speed if self._profile.reverse.holds(self._values) else speed

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.decoding.addresses import Address, address_of
 from eqrt.runtime.decoding.bindings import Binder
-from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField
+from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField, Reference
 from eqrt.runtime.decoding.dbc_files import Dbc, DbcMessage
 from eqrt.runtime.decoding.dbc_tables import Column, SignalTable
 from eqrt.runtime.decoding.profile_schema import EgoMessageTable, EgoTable
@@ -50,6 +50,8 @@ class EgoProfile:
     numbers: Mapping[str, BoundField]
     """Keys as in the profile, values in SI units; heading is clockwise from north, other angles and
     rates counter-clockwise."""
+    pose_columns: tuple[Reference, ...]
+    """What a pose is made of: it counts once, however long `hold_s` is."""
     reverse: BoundCondition | None
     """Where it holds, the speed is backward."""
     valid: BoundCondition | None
@@ -94,6 +96,13 @@ def bind_ego(table: EgoTable, dbc: Dbc, id_offset: int, where: str) -> EgoProfil
         bus=table.bus,
         parts=tuple(parts),
         numbers=numbers,
+        pose_columns=tuple(
+            column
+            for pose in _POSES
+            for key in pose
+            if key in numbers
+            for column in numbers[key].columns
+        ),
         reverse=reverse or None,
         valid=valid or None,
         latency_s=table.latency_s,

@@ -96,9 +96,9 @@ class SensorProfile:
     fields: ObjectFields
     velocity_kind: VelocityKind
     timeout_s: float
-    """A cycle that is not complete by then is closed as it is."""
+    """A cycle that is not complete so long after its last message is closed as it is."""
     silence_s: float
-    """After so long without a cycle it is not valid."""
+    """After so long without a cycle it is not valid; no cycle stays open for longer."""
     latency_s: float
     """From the measurement to the first message on the bus."""
     object_id_offset: int
