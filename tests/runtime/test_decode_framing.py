@@ -14,6 +14,7 @@ from eqrt.runtime.decoding.can_io import Decoder
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 from tiny_sensor import (
     COUNTED,
+    DBC,
     FIRST,
     PACKED,
     POLAR,
@@ -23,6 +24,7 @@ from tiny_sensor import (
     first,
     header,
     message,
+    profile_of,
     second,
 )
 
@@ -217,6 +219,30 @@ class TestCounters:
         for counter in (12, 14, 0, 2, 3):
             feed(decoder, [header(0, counter)])
         assert decoder.counters.bad_counter == 1
+
+    @pytest.mark.parametrize(("header_sign", "object_sign"), ["--", "-+", "+-"])
+    def test_a_counter_counts_in_its_bits_whatever_its_sign(
+        self, tmp_path: Path, header_sign: str, object_sign: str
+    ) -> None:
+        """0 to 15 and 0 again, and what is of another cycle is found out as ever."""
+        dbc = DBC.replace("COUNTER : 8|4@1+", f"COUNTER : 8|4@1{header_sign}")
+        dbc = dbc.replace("COUNTER : 40|4@1+", f"COUNTER : 40|4@1{object_sign}")
+        decoder = Decoder(profile_of(tmp_path, COUNTED, dbc))
+        for i in range(32):
+            objects = [first(1, 0, 1, counter=i % 16), first(2, 0, 2, counter=(i + 1) % 16)]
+            seconds = [second(1, 4.0), second(2, 4.0)]
+            (cycle,) = feed(decoder, [header(2, i % 16), *objects, *seconds], at_s=float(i))
+            assert cycle.object_id.tolist() == [1]
+        assert decoder.counters.bad_counter == 32  # the second object of every cycle
+
+    def test_the_messages_of_slots_count_in_their_bits(self, tmp_path: Path) -> None:
+        dbc = DBC.replace("COUNTER : 40|4@1+", "COUNTER : 40|4@1-")
+        decoder = Decoder(profile_of(tmp_path, SLOTS, dbc))
+        for i in range(32):
+            firsts = [first(k + 1, 0, 0, slot=k, counter=i % 16) for k in range(4)]
+            cycles = feed(decoder, [*firsts, *(second(0, 4.0, slot=k) for k in range(4))], float(i))
+            assert [cycle.object_id.tolist() for cycle in cycles] == [[0, 1, 2, 3]]
+        assert decoder.counters.bad_counter == 0
 
     def test_an_object_of_another_cycle_is_left_out(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTED)
