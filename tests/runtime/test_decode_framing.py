@@ -376,6 +376,24 @@ class TestSingle:
         assert np.isnan(cycle.velocity).all()
         assert cycle.position.tolist() == [[20.0, 0.0]]
 
+    @pytest.mark.parametrize(
+        ("condition", "raw", "is_valid"),
+        [
+            ("RANGE != 6553.4", 65534, False),
+            ("RANGE != 6553.4", 65533, True),
+            ("RANGE < 102.3", 1023, False),
+            ("RANGE <= 102.3", 1023, True),
+        ],
+    )
+    def test_a_value_is_compared_as_the_dbc_writes_it(
+        self, tmp_path: Path, condition: str, raw: int, is_valid: bool
+    ) -> None:
+        """As floats, 65534 * 0.1 is 6553.400000000001, and 1023 * 0.1 is above 102.3."""
+        text = SINGLE.replace("RANGE > 0", condition)
+        data = raw.to_bytes(2, "little") + bytes(6)
+        (cycle,) = feed(decoder_of(tmp_path, text), [message(POLAR, data)])
+        assert len(cycle.object_id) == is_valid
+
     def test_a_message_without_a_valid_object_is_an_empty_cycle(self, tmp_path: Path) -> None:
         (cycle,) = feed(decoder_of(tmp_path, SINGLE), [polar(0, 0, 0)])
         assert len(cycle.object_id) == 0
