@@ -12,12 +12,15 @@ from typing import Any
 import can
 import cantools.database
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import eqrt.runtime.decoding.profile
-from eqrt.core.frames import Pose2
+from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
 from eqrt.runtime.decoding.generic_objects import ListProtection, encode_cycle
+from eqrt.runtime.decoding.geodesy import MapOrigin
 from eqrt.runtime.decoding.profile import load_profile
 from tiny_sensor import DBC, EGO, GEAR, decoder_of, message, profile_of
 
@@ -256,6 +259,39 @@ def test_a_heading_is_turned_into_a_yaw_from_east() -> None:
     convergence = math.radians(0.02) * math.sin(math.radians(49.01))
     pose = pose_of(decoder, sbg_messages(49.01, 8.42, heading_rad=0.5))
     assert pose.yaw_rad == pytest.approx(math.pi / 2 - 0.5 + convergence, abs=1e-4)
+
+
+@given(
+    latitude_deg=st.floats(-80.0, 80.0),
+    west_deg=st.floats(-0.2, 0.2),
+    east_deg=st.floats(-0.2, 0.2),
+    heading_rad=st.floats(0.0, math.tau),
+)
+def test_poses_at_the_180th_meridian_are_as_at_any_other(
+    latitude_deg: float, west_deg: float, east_deg: float, heading_rad: float
+) -> None:
+    """The same distance from an origin on either side of it as at Greenwich; Fiji lies across."""
+    here, there = (
+        MapOrigin(math.radians(latitude_deg), longitude_rad(meridian_deg + west_deg)).pose(
+            math.radians(latitude_deg), longitude_rad(meridian_deg + east_deg), heading_rad
+        )
+        for meridian_deg in (0.0, 180.0)
+    )
+    assert (there.x_m, there.y_m) == pytest.approx((here.x_m, here.y_m), abs=1e-6)
+    assert wrap_angle(there.yaw_rad - here.yaw_rad) == pytest.approx(0.0, abs=1e-9)
+
+
+def longitude_rad(degrees: float) -> float:
+    """As an INS tells it: -180 to 180 degrees, in radians."""
+    return wrap_angle(math.radians(degrees))
+
+
+@pytest.mark.parametrize("longitude_deg", [179.9995, -179.9995])
+def test_east_stays_east_across_the_180th_meridian(longitude_deg: float) -> None:
+    decoder = Decoder(load_profile("sbg-ins"), map_origin_deg=(-16.8, 179.999))
+    pose = pose_of(decoder, sbg_messages(-16.8, longitude_deg, heading_rad=math.pi / 2))
+    assert pose.x_m == pytest.approx({179.9995: 53.30, -179.9995: 159.90}[longitude_deg], abs=0.02)
+    assert pose.yaw_rad == pytest.approx(0.0, abs=1e-4)
 
 
 def test_without_a_map_the_first_pose_is_the_origin() -> None:

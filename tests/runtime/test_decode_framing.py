@@ -15,6 +15,7 @@ from eqrt.runtime.decoding.can_io import Decoder
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 from tiny_sensor import (
     COUNTED,
+    DBC,
     FIRST,
     PACKED,
     POLAR,
@@ -24,6 +25,7 @@ from tiny_sensor import (
     first,
     header,
     message,
+    profile_of,
     second,
 )
 
@@ -269,6 +271,30 @@ class TestCounters:
             feed(decoder, [header(0, counter)])
         assert decoder.counters.bad_counter == 1
 
+    @pytest.mark.parametrize(("header_sign", "object_sign"), ["--", "-+", "+-"])
+    def test_a_counter_counts_in_its_bits_whatever_its_sign(
+        self, tmp_path: Path, header_sign: str, object_sign: str
+    ) -> None:
+        """0 to 15 and 0 again, and what is of another cycle is found out as ever."""
+        dbc = DBC.replace("COUNTER : 8|4@1+", f"COUNTER : 8|4@1{header_sign}")
+        dbc = dbc.replace("COUNTER : 40|4@1+", f"COUNTER : 40|4@1{object_sign}")
+        decoder = Decoder(profile_of(tmp_path, COUNTED, dbc))
+        for i in range(32):
+            objects = [first(1, 0, 1, counter=i % 16), first(2, 0, 2, counter=(i + 1) % 16)]
+            seconds = [second(1, 4.0), second(2, 4.0)]
+            (cycle,) = feed(decoder, [header(2, i % 16), *objects, *seconds], at_s=float(i))
+            assert cycle.object_id.tolist() == [1]
+        assert decoder.counters.bad_counter == 32  # the second object of every cycle
+
+    def test_the_messages_of_slots_count_in_their_bits(self, tmp_path: Path) -> None:
+        dbc = DBC.replace("COUNTER : 40|4@1+", "COUNTER : 40|4@1-")
+        decoder = Decoder(profile_of(tmp_path, SLOTS, dbc))
+        for i in range(32):
+            firsts = [first(k + 1, 0, 0, slot=k, counter=i % 16) for k in range(4)]
+            cycles = feed(decoder, [*firsts, *(second(0, 4.0, slot=k) for k in range(4))], float(i))
+            assert [cycle.object_id.tolist() for cycle in cycles] == [[0, 1, 2, 3]]
+        assert decoder.counters.bad_counter == 0
+
     def test_an_object_of_another_cycle_is_left_out(self, tmp_path: Path) -> None:
         decoder = decoder_of(tmp_path, COUNTED)
         objects = [first(1, 0, 1, counter=5), first(2, 0, 2, counter=4)]
@@ -400,6 +426,24 @@ class TestSingle:
         (cycle,) = feed(decoder_of(tmp_path, SINGLE), [polar(20, 0, -3276.8)])
         assert np.isnan(cycle.velocity).all()
         assert cycle.position.tolist() == [[20.0, 0.0]]
+
+    @pytest.mark.parametrize(
+        ("condition", "raw", "is_valid"),
+        [
+            ("RANGE != 6553.4", 65534, False),
+            ("RANGE != 6553.4", 65533, True),
+            ("RANGE < 102.3", 1023, False),
+            ("RANGE <= 102.3", 1023, True),
+        ],
+    )
+    def test_a_value_is_compared_as_the_dbc_writes_it(
+        self, tmp_path: Path, condition: str, raw: int, is_valid: bool
+    ) -> None:
+        """As floats, 65534 * 0.1 is 6553.400000000001, and 1023 * 0.1 is above 102.3."""
+        text = SINGLE.replace("RANGE > 0", condition)
+        data = raw.to_bytes(2, "little") + bytes(6)
+        (cycle,) = feed(decoder_of(tmp_path, text), [message(POLAR, data)])
+        assert len(cycle.object_id) == is_valid
 
     def test_a_message_without_a_valid_object_is_an_empty_cycle(self, tmp_path: Path) -> None:
         (cycle,) = feed(decoder_of(tmp_path, SINGLE), [polar(0, 0, 0)])

@@ -114,6 +114,37 @@ def test_the_last_value_of_a_table_is_one_of_it(tmp_path: Path) -> None:
     assert decoded(tmp_path, rich(kind=15)).object_class.tolist() == [ObjectClass.ANIMAL]
 
 
+@pytest.mark.parametrize(
+    ("sign", "raws"), [("+", {1: 1, 14: 14, 15: 15}), ("-", {1: 1, 14: -2, 15: -1})]
+)
+def test_a_table_lists_the_raw_values_that_the_dbc_lists(
+    tmp_path: Path, sign: str, raws: dict[int, int]
+) -> None:
+    """Of a signed signal all bits set is -1, for every value that the bits can hold."""
+    dbc = RICH_DBC.replace("96|4@1+", f"96|4@1{sign}").replace("100|4@1+", f"100|4@1{sign}")
+    names = {1: "car", 14: "pedestrian", 15: "truck"}
+    text = RICH_TOML.replace(
+        '{ 1 = "car", 15 = "animal" }',
+        "{ " + ", ".join(f'{raws[bits]} = "{name}"' for bits, name in names.items()) + " }",
+    ).replace("{ 1 = 0.25, 3 = 0.75 }", f"{{ {raws[14]} = 0.25, {raws[15]} = 0.75 }}")
+    decoder = Decoder(profile_of(tmp_path, text, dbc))
+    for bits in range(16):
+        (cycle,) = feed(decoder, [rich(kind=bits, quality=bits)])
+        expected = ObjectClass[names.get(bits, "unknown").upper()]
+        assert cycle.object_class.tolist() == [expected]
+        np.testing.assert_array_equal(cycle.existence, [{14: 0.25, 15: 0.75}.get(bits, NAN)])
+
+
+def test_a_signal_may_be_in_a_table_and_in_conditions(tmp_path: Path) -> None:
+    """The table goes by its bits, a condition by its raw value: both are right."""
+    dbc = RICH_DBC.replace("96|4@1+", "96|4@1-")
+    text = RICH_TOML.replace("15 = ", "-1 = ").replace("QUALITY == 3", "raw(KIND) == -1")
+    for kind, expected in ((15, ObjectClass.ANIMAL), (1, ObjectClass.CAR)):
+        (cycle,) = feed(Decoder(profile_of(tmp_path, text, dbc)), [rich(kind=kind)])
+        assert cycle.object_class.tolist() == [expected]
+        assert cycle.is_new.tolist() == [kind == 15]
+
+
 def test_what_a_short_message_lacks_is_not_known(tmp_path: Path) -> None:
     cut = rich(kind=15)
     cut.data = cut.data[:10]

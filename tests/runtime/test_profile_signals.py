@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eqrt.core.errors import ProfileError
-from tiny_sensor import COUNTED, DBC, profile_of
+from tiny_sensor import COUNTED, DBC, SENSOR, profile_of
 
 _X = ' SG_ X : 0|16@1- (0.01,0) [0|0] "m" R\n'
 _ID = ' SG_ ID : 32|8@1+ (1,0) [0|0] "" R\n'
@@ -69,6 +69,39 @@ def test_a_table_over_a_float_is_refused(tmp_path: Path) -> None:
     text = f'{COUNTED}\n[sensor.fields.class]\nsignal = "first.STATE"\ntable = {{ 1 = "car" }}\n'
     said = refused(tmp_path, text, f"{dbc}SIG_VALTYPE_ 272 STATE : 1;\n")
     assert "first.STATE is a float; a table has integers" in said
+
+
+@pytest.mark.parametrize(
+    ("sign", "raw", "complaint"),
+    [
+        ("+", -1, "first.STATE is never -1: the DBC has it unsigned, 0 to 15"),
+        ("+", 16, "first.STATE is never 16: the DBC has it unsigned, 0 to 15"),
+        ("-", 15, "first.STATE is never 15: the DBC has it signed, -8 to 7"),
+        ("-", -9, "first.STATE is never -9: the DBC has it signed, -8 to 7"),
+    ],
+)
+def test_a_value_that_the_signal_never_has_is_refused_with_those_that_it_has(
+    tmp_path: Path, sign: str, raw: int, complaint: str
+) -> None:
+    dbc = DBC.replace("STATE : 44|4@1+", f"STATE : 44|4@1{sign}")
+    text = (
+        f'{COUNTED}\n[sensor.fields.class]\nsignal = "first.STATE"\ntable = {{ {raw} = "car" }}\n'
+    )
+    assert refused(tmp_path, text, dbc).endswith(f"fields.class.table: {complaint}")
+
+
+@pytest.mark.parametrize("kind", ["8|4@1+ (1,0)", "8|3@1- (1,0)", "8|3@1+ (2,0)", "8|3@1+ (1,1)"])
+def test_a_table_over_objects_that_have_other_numbers_is_refused(tmp_path: Path, kind: str) -> None:
+    """One table serves all of them."""
+    kinds = f' SG_ O1_K : 120|3@1+ (1,0) [0|0] "" R\n SG_ O2_K : 12{kind} [0|0] "" R\n'
+    dbc = DBC.replace(" SG_ O3_ID", f"{kinds} SG_ O3_ID")
+    text = (
+        SENSOR + 'framing = "single"\nobjects = { first = 1, last = 2 }\n'
+        'messages = { p = "PACKED" }\n[sensor.fields]\nid = "O{object}_ID"\nx = "O{object}_X"\n'
+        'y = "O{object}_Y"\nclass = { signal = "O{object}_K", table = { 1 = "car" } }\n'
+    )
+    said = refused(tmp_path, text, dbc)
+    assert "fields.class: 'O{object}_K' differs from object to object in bits, sign or sc" in said
 
 
 @pytest.mark.parametrize("number", ["9" * 30, f"-{'9' * 30}"])

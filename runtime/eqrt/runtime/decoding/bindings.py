@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.decoding.bound_fields import BoundCondition, BoundField, Reference
-from eqrt.runtime.decoding.conditions import ConditionError, parse_condition
+from eqrt.runtime.decoding.conditions import Comparison, ConditionError, parse_condition
 from eqrt.runtime.decoding.dbc_files import DbcMessage
 from eqrt.runtime.decoding.dbc_tables import Column, Signal
 from eqrt.runtime.decoding.profile_schema import FieldTable, MeanTable, SpanTable
@@ -42,11 +43,11 @@ class Binder:
         self._names = list(parts)
         self._slots = slots
         self._objects = objects
-        self._rows: list[dict[tuple[str, float, bool], list[Column]]] = [{} for _ in parts]
+        self._rows: list[list[list[Column]]] = [[] for _ in parts]
 
     def columns(self, part: int) -> list[Column]:
         """The columns of a part: row after row, for every object in the message."""
-        return [column for row in self._rows[part].values() for column in row]
+        return [column for row in self._rows[part] for column in row]
 
     def field(self, key: str, entry: str | FieldTable | MeanTable, measure: str) -> BoundField:
         """A field in SI units; `measure` says what it must measure."""
@@ -64,9 +65,9 @@ class Binder:
         return BoundField(tuple(columns), when)
 
     def condition(self, key: str, text: str) -> BoundCondition:
-        """A condition on physical or raw values."""
+        """A condition on physical or raw values; those that have raw ones are compared by them."""
         try:
-            condition = parse_condition(text)
+            condition = parse_condition(text, partial(self._of_raw, key))
         except ConditionError as error:
             raise self.error(key, f"{text!r} is not a condition: {error}") from error
         operands = [self.reference(key, x.name, raw=x.is_raw) for x in condition.operands]
@@ -76,24 +77,51 @@ class Binder:
         self, key: str, name: str, factor: float = 1.0, *, raw: bool = False
     ) -> Reference:
         """The column for PART.SIGNAL (or SIGNAL, where there is one part) times `factor`."""
-        part, signal = self._split(key, name)
-        rows = self._rows[part]
-        if (signal, factor, raw) not in rows:
-            found = [self._signal(key, part, signal, number) for number in self._objects]
-            rows[signal, factor, raw] = [
-                Column(x, 1.0, 0.0) if raw else Column(x, x.scale * factor, x.offset * factor)
-                for x in found
-            ]
-        return Reference(part, list(rows).index((signal, factor, raw)))
+        if raw:
+            return self._row(key, name, lambda x: Column(x, 1.0, 0.0))
+        return self._row(key, name, lambda x: Column(x, x.scale * factor, x.offset * factor))
+
+    def bits(self, key: str, name: str) -> Reference:
+        """The column for the signal's bits: from 0 on, also where the DBC has it signed."""
+        return self._row(key, name, lambda x: Column(replace(x, is_signed=False), 1.0, 0.0))
 
     def signal(self, key: str, name: str) -> Signal:
         """What PART.SIGNAL means, in the first slot and object."""
         part, signal = self._split(key, name)
         return self._signal(key, part, signal, self._objects[0])
 
+    def common_signal(self, key: str, name: str) -> Signal:
+        """The same where it must be one kind of number in every object."""
+        found = self._signals(key, name)
+        if len({(x.length, x.is_signed, x.is_float, x.scale, x.offset) for x in found}) > 1:
+            raise self.error(key, f"{name!r} differs from object to object in bits, sign or scale")
+        return found[0]
+
     def error(self, key: str, text: str) -> ProfileError:
         """An error that says where in the profile it is."""
         return ProfileError(f"{self._where}.{key}: {text}")
+
+    def _of_raw(self, key: str, comparison: Comparison) -> Comparison:
+        name = comparison.operand.name
+        signals = self._signals(key, name)
+        if comparison.operand.is_raw or all(x.is_float or x.scale == 0.0 for x in signals):
+            return comparison
+        if len({(x.is_float, x.scale, x.offset) for x in signals}) > 1:
+            raise self.error(key, f"{name!r} differs from object to object in scale or offset")
+        return comparison.of_raw(signals[0].scale, signals[0].offset)
+
+    def _row(self, key: str, name: str, column_of: Callable[[Signal], Column]) -> Reference:
+        row = [column_of(signal) for signal in self._signals(key, name)]
+        part, _ = self._split(key, name)
+        rows = self._rows[part]
+        if row not in rows:
+            rows.append(row)
+        return Reference(part, rows.index(row))
+
+    def _signals(self, key: str, name: str) -> list[Signal]:
+        """What PART.SIGNAL means, in every object."""
+        part, signal = self._split(key, name)
+        return [self._signal(key, part, signal, number) for number in self._objects]
 
     def _split(self, key: str, name: str) -> tuple[int, str]:
         part, dot, signal = name.partition(".")

@@ -2,9 +2,9 @@
 
     a.VALID == 1 and (a.LONG_DIST < 255 or not raw(a.STATE) == 0x7)
 
-A name is a signal's physical value, as the DBC scales it, or `raw(NAME)` its bits. A comparison
-with a signal that is not in the message is false, whatever the operator. Nothing is executed: the
-text is parsed by the grammar below, once, at start.
+A name is a signal's physical value, as the DBC scales it, or `raw(NAME)` what its bits say before
+that. A comparison with a signal that is not in the message is false, whatever the operator. Nothing
+is executed: the text is parsed by the grammar below, once, at start.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 Evaluate = Callable[[Sequence[Any]], Any]
 """Values of the operands, all floats or all arrays of one shape -> truth, of the same kind."""
@@ -29,6 +31,34 @@ class Operand:
 
 
 @dataclass(frozen=True, slots=True)
+class Comparison:
+    """A signal compared with a number."""
+
+    operand: Operand
+    sign: str
+    number: float
+    half_digit: float
+    """Half of what the number's last digit counts: 0.005 for 1.25."""
+
+    def of_raw(self, scale: float, offset: float) -> Comparison:
+        """The same of raw values, where physical ones are raw * scale + offset, and scale not 0.
+
+        The number becomes the raw value that it stands for, to be compared exactly: as floats,
+        65534 * 0.1 and 6553.4 differ. A number that stands for none stays between two of them.
+        """
+        exact = (self.number - offset) / scale
+        nearest = float(np.rint(exact))
+        float_error = _FLOAT_ERROR * (abs(self.number) + abs(offset))
+        tolerance = min((self.half_digit + float_error) / abs(scale), _MAX_ROUNDING)
+        number = nearest if abs(exact - nearest) <= tolerance else exact
+        sign = self.sign if scale > 0.0 else _MIRRORED.get(self.sign, self.sign)
+        return Comparison(Operand(self.operand.name, True), sign, number, 0.0)
+
+
+Translate = Callable[[Comparison], Comparison]
+
+
+@dataclass(frozen=True, slots=True)
 class Condition:
     """A parsed condition."""
 
@@ -40,9 +70,9 @@ class ConditionError(ValueError):
     """The text is not a condition; the message says what was found and what was expected."""
 
 
-def parse_condition(text: str) -> Condition:
-    """Raises ConditionError."""
-    parser = _Parser(text)
+def parse_condition(text: str, translate: Translate = lambda comparison: comparison) -> Condition:
+    """`translate` gives what shall be compared in place of a comparison. Raises ConditionError."""
+    parser = _Parser(text, translate)
     evaluate = parser.any_of()
     if parser.token:
         raise parser.error("'and', 'or' or the end")
@@ -54,11 +84,16 @@ _NUMBER = r"[-+]?[\d.](?:[eE][-+]\d|[\w.])*"
 _TOKEN = re.compile(rf"\s*({_NAME}|{_NUMBER}|[<>=!]=?|\S)")
 _COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
     "==": operator.eq,
+    # Unlike Python's, false for a signal that is not there (NaN).
+    "!=": lambda value, number: (value < number) | (value > number),
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
     ">=": operator.ge,
 }
+_MIRRORED = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
+_FLOAT_ERROR = 1e-15  # of a few roundings, relative; one is 1.1e-16
+_MAX_ROUNDING = 0.1  # of a bit: how far a value may be from the decimals that are written for it
 _WORDS = ("and", "or", "not", "raw")
 _MAX_DEPTH = 20  # of parentheses and `not`s
 
@@ -66,8 +101,9 @@ _MAX_DEPTH = 20  # of parentheses and `not`s
 class _Parser:
     """Recursive descent; `token` is the next one, empty at the end."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, translate: Translate) -> None:
         self.operands: list[Operand] = []
+        self._translate = translate
         self._tokens = [match.group(1) for match in _TOKEN.finditer(text)]
         self._position = 0
         self._depth = 0
@@ -112,19 +148,19 @@ class _Parser:
 
     def comparison(self) -> Evaluate:
         """operand ('==' | '!=' | '<' | '<=' | '>' | '>=') number"""
-        index = self._operand()
+        operand = self._operand()
         sign = self._take()
-        if sign != "!=" and sign not in _COMPARISONS:
+        if sign not in _COMPARISONS:
             self._position -= bool(sign)
             raise self.error("a comparison (== != < <= > >=)")
-        number = self._number()
-        if sign == "!=":
-            # The second half is false for a signal that is not there (NaN).
-            return lambda values: (values[index] != number) & (values[index] == values[index])
-        compare = _COMPARISONS[sign]
+        comparison = self._translate(Comparison(operand, sign, *self._number()))
+        if comparison.operand not in self.operands:
+            self.operands.append(comparison.operand)
+        index = self.operands.index(comparison.operand)
+        compare, number = _COMPARISONS[comparison.sign], comparison.number
         return lambda values: compare(values[index], number)
 
-    def _operand(self) -> int:
+    def _operand(self) -> Operand:
         is_raw = self._accept("raw")
         if is_raw:
             self._expect("(")
@@ -133,19 +169,21 @@ class _Parser:
         operand = Operand(self._take(), is_raw)
         if is_raw:
             self._expect(")")
-        if operand not in self.operands:
-            self.operands.append(operand)
-        return self.operands.index(operand)
+        return operand
 
-    def _number(self) -> float:
+    def _number(self) -> tuple[float, float]:
+        """The number, and half of what its last digit counts."""
+        text = self.token.lower()
         try:
-            number = float(int(self.token, 0)) if "x" in self.token.lower() else float(self.token)
+            is_hex = "x" in text
+            number = float(int(text, 0)) if is_hex else float(text)
+            half_digit = 0.5 if is_hex else 0.5 * _last_digit(text)
         except (ValueError, OverflowError):
-            number = math.nan
+            number = half_digit = math.nan
         if not math.isfinite(number):
             raise self.error("a number")
         self._position += 1
-        return number
+        return number, half_digit
 
     def _take(self) -> str:
         token = self.token
@@ -160,6 +198,13 @@ class _Parser:
     def _expect(self, word: str) -> None:
         if not self._accept(word):
             raise self.error(repr(word))
+
+
+def _last_digit(number: str) -> float:
+    """What the last digit of a decimal number counts: 0.01 for "1.25", 100 for "12e2"."""
+    mantissa, _, exponent = number.partition("e")
+    decimals = len(mantissa.partition(".")[2])
+    return float(f"1e{int(exponent or 0) - decimals}")
 
 
 def _joined(join: Callable[[Any, Any], Any], terms: list[Evaluate]) -> Evaluate:

@@ -43,6 +43,12 @@ class Signal:
     """The multiplexer that must hold one of `selected_by` for the signal to be in the message."""
     selected_by: frozenset[int] = frozenset()
 
+    @property
+    def raw_values(self) -> range:
+        """Every value of `raw` that the bits can hold, of a signal that is no float."""
+        lowest = -(1 << (self.length - 1)) if self.is_signed else 0
+        return range(lowest, lowest + (1 << self.length))
+
     def raw(self, data: Payload) -> int | None:
         """The signal's bits as an integer; None if the message is too short or holds another."""
         if len(data) <= self.last_byte:

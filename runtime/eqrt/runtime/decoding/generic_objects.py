@@ -172,8 +172,7 @@ def _pack(name: str, values: Mapping[str, ArrayLike]) -> NDArray[np.uint8]:
 
 
 def _raw(values: NDArray[np.float64], signal: Signal, has_not_available: bool) -> NDArray[np.int64]:
-    lowest = -(1 << signal.length - 1) if signal.is_signed else 0
-    highest = lowest + (1 << signal.length) - 1
+    lowest, highest = signal.raw_values[0], signal.raw_values[-1]
     not_available = lowest if signal.is_signed else highest
     if has_not_available:  # kept out of the range of values
         lowest, highest = (lowest + 1, highest) if signal.is_signed else (lowest, highest - 1)

@@ -35,7 +35,7 @@ class MapOrigin:
         east = cos_lon * offset[1] - sin_lon * offset[0]
         north = cos_lat * offset[2] - sin_lat * outward
         # Meridians draw together towards the poles: north there is not quite the map's.
-        convergence = (longitude_rad - self.longitude_rad) * math.sin(latitude_rad)
+        convergence = wrap_angle(longitude_rad - self.longitude_rad) * math.sin(latitude_rad)
         return Pose2(east, north, wrap_angle(math.pi / 2.0 - heading_rad + convergence))
 
     def _on_earth(self) -> Vector3:

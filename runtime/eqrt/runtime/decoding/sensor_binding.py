@@ -155,18 +155,24 @@ class _Sensor:
         return self._lookup("class", entry.signal, numbers, float(ObjectClass.UNKNOWN))
 
     def _lookup(self, key: str, signal: str, table: dict[int, float], default: float) -> Lookup:
-        found = self.binder.signal(f"fields.{key}", signal)
+        found = self.binder.common_signal(f"fields.{key}", signal)
         if found.is_float:
             raise self.binder.error(f"fields.{key}", f"{signal} is a float; a table has integers")
-        bits = found.length
-        if bits > _MAX_TABLE_BITS:
-            raise self.binder.error(f"fields.{key}", f"{signal} has {bits} bits, too many to list")
-        values = np.full((1 << bits) + 1, default)
+        if found.length > _MAX_TABLE_BITS:
+            raise self.binder.error(
+                f"fields.{key}", f"{signal} has {found.length} bits, too many to list"
+            )
+        known = found.raw_values
+        values = np.full(len(known) + 1, default)
         for raw, value in table.items():
-            if not 0 <= raw < 1 << bits:
-                raise self.binder.error(f"fields.{key}.table", f"{signal} is never {raw}")
-            values[raw] = value
-        return Lookup(self.binder.reference(f"fields.{key}", signal, raw=True), values)
+            if raw not in known:
+                kind = "signed" if found.is_signed else "unsigned"
+                raise self.binder.error(
+                    f"fields.{key}.table",
+                    f"{signal} is never {raw}: the DBC has it {kind}, {known[0]} to {known[-1]}",
+                )
+            values[raw % len(known)] = value
+        return Lookup(self.binder.bits(f"fields.{key}", signal), values)
 
     def _condition(self, key: str, text: str | None) -> BoundCondition | None:
         return None if text is None else self.binder.condition(f"fields.{key}", text)
@@ -236,5 +242,4 @@ class _Sensor:
 
 
 def _bound_counter(binder: Binder, key: str, signal: str) -> Counter:
-    length = binder.signal(key, signal).length
-    return Counter(binder.reference(key, signal, raw=True), 1 << length)
+    return Counter(binder.bits(key, signal), 1 << binder.common_signal(key, signal).length)

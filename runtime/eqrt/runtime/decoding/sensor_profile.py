@@ -31,7 +31,7 @@ class Lookup:
 
     column: Reference
     table: NDArray[np.float64]
-    """(2 ** bits + 1,) by raw value; the last is for a signal that is not in the message."""
+    """(2 ** length + 1,) by the signal's bits; the last is for one that is not in the message."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
