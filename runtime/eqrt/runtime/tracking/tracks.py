@@ -11,12 +11,14 @@ Everything lives in arrays of fixed size: rows for tracks, right-aligned columns
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.detections import Detections
+from eqrt.runtime.decoding.latency_checks import MAX_INPUT_AGE_S
 from eqrt.runtime.tracking.ego import EgoState
 from eqrt.runtime.tracking.measurements import Measurements, measure
 from eqrt.runtime.tracking.track_history import (
@@ -56,6 +58,9 @@ class Tracks:
     """(M,) as the sensor numbers it."""
     timestamp_s: Float64
     """(M,) of the last measurement."""
+    told_until_s: Float64
+    """(M,) up to when its sensor has told: the time of the snapshot, less what the sensor's cycles
+    lag behind others'. From `timestamp_s` to then they were without it."""
     position: Float64
     """(M, 2) metres, the last measurement."""
     velocity: Float64
@@ -103,6 +108,13 @@ class TrackCounters:
     """Times that all tracks were forgotten: the map frame jumped or the clock was set back."""
 
 
+class _Cycle(NamedTuple):
+    """When a sensor's newest cycle was measured, and when it came."""
+
+    timestamp_s: float = -np.inf
+    received_s: float = 0.0
+
+
 class TrackStore:
     """Up to `capacity` tracks of up to `depth` measurements each."""
 
@@ -113,6 +125,8 @@ class TrackStore:
         self._next_track_id = 1
         self._ego_epoch: int | None = None
         self._newest_s = -np.inf
+        self._cycles: list[_Cycle] = []  # the newest of each sensor
+        self._behind_s = np.zeros(1)  # (sensors,) see `_hear`
         self._used = np.zeros(capacity, np.bool_)
         self._sensor = np.zeros(capacity, np.intp)
         self._object_id = np.zeros(capacity, np.int64)
@@ -136,7 +150,7 @@ class TrackStore:
             return
         now_s = detections.timestamp_s
         self._advance(now_s, ego.epoch)
-        sensor = self._sensor_index(detections.sensor)
+        sensor = self._hear(detections)
         found = self._admit(measure(detections, ego, ego_from_sensor))
         row = self._match(sensor, found.object_id)
         on_time = (row == _NO_ROW) | (self._times_s[row, -1] < now_s)
@@ -151,8 +165,12 @@ class TrackStore:
         self._append(row, now_s, found)
 
     def snapshot(self, now_s: float, max_age_s: float = MAX_GAP_S) -> Tracks:
-        """The tracks whose last measurement is at most `max_age_s` old (or after `now_s`)."""
-        row = np.flatnonzero(self._used & (self._times_s[:, -1] >= now_s - max_age_s - SAME_TIME_S))
+        """The tracks whose sensors were at most `max_age_s` without them at `now_s`, the time of a
+        cycle.
+        """
+        told_until_s = self._told_until_s(now_s)
+        is_recent = self._times_s[:, -1] >= told_until_s - max_age_s - SAME_TIME_S
+        row = np.flatnonzero(self._used & is_recent)
         velocity = self._velocity[row]
         speed_mps = np.hypot(velocity[:, 0], velocity[:, 1])
         fitted = self._fitted_velocity[row]
@@ -163,6 +181,7 @@ class TrackStore:
             sensor=self._sensor[row],
             object_id=self._object_id[row],
             timestamp_s=self._times_s[row, -1],
+            told_until_s=told_until_s[row],
             position=self._positions[row, -1],
             velocity=velocity,
             speed_mps=speed_mps,
@@ -195,11 +214,31 @@ class TrackStore:
     def _clear(self) -> None:
         self.counters.resets += bool(self._used.any())
         self._used[:] = False
+        self._cycles = [_Cycle()] * len(self.sensors)
 
-    def _sensor_index(self, name: str) -> int:
-        if name not in self.sensors:
-            self.sensors.append(name)
-        return self.sensors.index(name)
+    def _hear(self, detections: Detections) -> int:
+        """Note a sensor's cycle, and how far each sensor's cycles lag behind the newest of all.
+
+        Counted as if each sensor had gone on since its last cycle came, so that one that falls
+        silent does not seem to lag more and more.
+        """
+        if detections.sensor not in self.sensors:
+            self.sensors.append(detections.sensor)
+            self._cycles.append(_Cycle())
+        sensor = self.sensors.index(detections.sensor)
+        if detections.timestamp_s > self._cycles[sensor].timestamp_s:
+            self._cycles[sensor] = _Cycle(detections.timestamp_s, detections.received_s)
+        behind_s = [
+            self._newest_s - (cycle.timestamp_s + (detections.received_s - cycle.received_s))
+            for cycle in self._cycles
+        ]
+        self._behind_s = np.array([min(max(0.0, lag_s), MAX_INPUT_AGE_S) for lag_s in behind_s])
+        return sensor
+
+    def _told_until_s(self, now_s: float) -> Float64:
+        """Of every row, see `Tracks.told_until_s`."""
+        told_until_s: Float64 = now_s - self._behind_s[self._sensor]
+        return told_until_s
 
     def _admit(self, found: Measurements) -> Measurements:
         """Those with a possible position and an id of their own."""
