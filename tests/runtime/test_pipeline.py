@@ -11,11 +11,21 @@ import can
 import numpy as np
 import pytest
 
-from drives import DRIVES, TILE, Car, cycle, first_seconds, shipped_predictor, traffic
+from drives import (
+    DRIVES,
+    TILE,
+    Car,
+    cycle,
+    first_seconds,
+    object_list,
+    shipped_predictor,
+    traffic,
+)
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
 from eqrt.core.scene import Scene
 from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import Pipeline
@@ -118,6 +128,34 @@ def test_cycles_that_come_too_close_share_a_prediction() -> None:
     assert np.diff([forecast.timestamp_s for forecast in forecasts]) == pytest.approx(0.1)
     assert pipeline.counters.skipped == 20
     assert pipeline.tracks.counters.cycles == 41
+
+
+@pytest.mark.parametrize("rate_hz", [40, 50])
+def test_a_fast_sensor_does_not_leave_its_objects_partial(rate_hz: int) -> None:
+    """Two seconds are in their histories after two seconds."""
+    messages = []
+    for step in range(round(2.2 * rate_hz)):
+        cars = object_list(CARS, step / rate_hz)
+        messages += encode_cycle(
+            cars,
+            timestamp_s=step / rate_hz,
+            counter=step % 256,
+            speed_mps=0.0,
+            yaw_rate_rad_s=0.0,
+            message_s=1e-4,
+        )
+    last = feed(pipeline_of(), messages)[-1]
+    assert last.agent_mode.tolist() == [Mode.RUN] * 3
+
+
+def test_every_sensor_may_list_as_many_objects_as_its_count_can_say(tmp_path: Path) -> None:
+    pipeline = two_sensors(tmp_path, 0.0)
+    everybody = range(255)
+    for message in (m for step in range(3) for m in of_both(step, everybody, everybody)):
+        pipeline.feed(message, message.timestamp)
+        pipeline.poll(message.timestamp)
+    pipeline.finish(100.3)
+    assert (pipeline.tracks.counters.tracks, pipeline.tracks.counters.dropped) == (510, 0)
 
 
 def test_a_second_sensor_that_measured_earlier_adds_no_prediction(tmp_path: Path) -> None:

@@ -32,6 +32,9 @@ from eqrt.runtime.tracking.ego import EgoState, EgoTracker
 from eqrt.runtime.tracking.track_history import MAX_GAP_S
 from eqrt.runtime.tracking.tracks import TrackStore
 
+SENSOR_TRACKS = 256
+"""There is room for so many objects at a time, times the number of sensors: sensors count theirs in
+eight bits."""
 MIN_PERIOD = 0.6
 """Cycles closer together than this many model steps share a prediction: radars send up to 20 Hz."""
 TARGET_AGE_S = MAX_GAP_S
@@ -107,7 +110,8 @@ class Pipeline:
             yaw_rate_bias_rad_s=profile.yaw_rate_bias_rad_s,
             stationary=stationary or not profile.has_ego,
         )
-        self.tracks = TrackStore()
+        steps, dt_s = predictor.contract.history_steps, predictor.contract.dt_s
+        self.tracks = TrackStore(steps, dt_s, capacity=SENSOR_TRACKS * len(profile.sensors))
         self.counters = PipelineCounters()
         self.times = StageTimes()
         self.profile = profile
@@ -159,6 +163,7 @@ class Pipeline:
         origin = tile.info.origin_deg if tile else None
         self.predictor, self.tile = predictor, tile
         self._runner = self._runner.succeeded_by(predictor)
+        self.tracks.reach(predictor.contract.history_steps, predictor.contract.dt_s)
         self._forecaster = Forecaster(
             predictor.contract, self._runner, lanes, self.tracks, self.ego
         )
