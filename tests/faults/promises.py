@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from eqrt.runtime.decoding.latency_checks import MAX_INPUT_AGE_S
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
-from eqrt.runtime.pipeline import MAX_INPUT_AGE_S, SILENT_PERIODS, TARGET_AGE_S
+from eqrt.runtime.pipeline import SILENT_PERIODS, TARGET_AGE_S
 
 AGENT_MODES = {Mode.RUN, Mode.PARTIAL, Mode.LATE, Mode.FALLBACK}
 _REACH_M = 100.0 * 3.1 + 2.0  # what the fastest object can cover in the horizon

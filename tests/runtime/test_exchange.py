@@ -18,6 +18,8 @@ from eqrt.runtime.pipeline import Pipeline, lanes_for
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.tiles import Tile, load_tile, save_tile
 from handmade_model import CONTRACT, write_handmade
+from steady_model import CONTRACT as STEADY
+from steady_model import Steady
 from tiny_sensor import EGO, message, profile_of
 from two_tiles import CARS, POSE, other_tile
 
@@ -49,6 +51,16 @@ def test_an_exchange_keeps_tracks_and_histories(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(ahead, axis=-1), 10.0, atol=0.2)  # 1 s at 10 m/s
     (nobody,) = said(pipeline, iter(cycle([], 9.0, pose=POSE)))
     assert nobody.trajectories.shape == (0, CONTRACT.num_modes, CONTRACT.horizon_steps, 2)
+
+
+def test_a_model_of_longer_histories_gets_them_as_they_come() -> None:
+    """Five seconds at 20 Hz, after a model that reads half a second."""
+    pipeline = Pipeline(load_profile("generic"), Steady())
+    longer = Steady(replace(STEADY, history_steps=50, dt_s=0.1))
+    pipeline.exchange(longer, None, None)
+    steps = [m for step in range(101) for m in cycle(CARS, step / 20)]
+    modes = [set(forecast.agent_mode.tolist()) for forecast in said(pipeline, steps)]
+    assert modes == [{Mode.PARTIAL}] * 49 + [{Mode.RUN}] * 2
 
 
 def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +11,21 @@ import can
 import numpy as np
 import pytest
 
-from drives import DRIVES, TILE, Car, cycle, first_seconds, shipped_predictor, traffic
+from drives import (
+    DRIVES,
+    TILE,
+    Car,
+    cycle,
+    first_seconds,
+    object_list,
+    shipped_predictor,
+    traffic,
+)
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
 from eqrt.core.scene import Scene
 from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import Pipeline
@@ -120,6 +130,34 @@ def test_cycles_that_come_too_close_share_a_prediction() -> None:
     assert pipeline.tracks.counters.cycles == 41
 
 
+@pytest.mark.parametrize("rate_hz", [40, 50])
+def test_a_fast_sensor_does_not_leave_its_objects_partial(rate_hz: int) -> None:
+    """Two seconds are in their histories after two seconds."""
+    messages = []
+    for step in range(round(2.2 * rate_hz)):
+        cars = object_list(CARS, step / rate_hz)
+        messages += encode_cycle(
+            cars,
+            timestamp_s=step / rate_hz,
+            counter=step % 256,
+            speed_mps=0.0,
+            yaw_rate_rad_s=0.0,
+            message_s=1e-4,
+        )
+    last = feed(pipeline_of(), messages)[-1]
+    assert last.agent_mode.tolist() == [Mode.RUN] * 3
+
+
+def test_every_sensor_may_list_as_many_objects_as_its_count_can_say(tmp_path: Path) -> None:
+    pipeline = two_sensors(tmp_path, 0.0)
+    everybody = range(255)
+    for message in (m for step in range(3) for m in of_both(step, everybody, everybody)):
+        pipeline.feed(message, message.timestamp)
+        pipeline.poll(message.timestamp)
+    pipeline.finish(100.3)
+    assert (pipeline.tracks.counters.tracks, pipeline.tracks.counters.dropped) == (510, 0)
+
+
 def test_a_second_sensor_that_measured_earlier_adds_no_prediction(tmp_path: Path) -> None:
     """Its objects are in the next one."""
     twin = COUNTED.replace('"tiny"', '"twin"', 1).replace(
@@ -135,6 +173,60 @@ def test_a_second_sensor_that_measured_earlier_adds_no_prediction(tmp_path: Path
         made += pipeline.poll(step / 10 + 0.06)
     assert [round(forecast.timestamp_s, 3) for forecast in made] == [0.0, 0.1, 0.2, 0.3, 0.4]
     assert [forecast.num_targets for forecast in made] == [1, 2, 2, 2, 2]
+
+
+def two_sensors(folder: Path, latency_s: float) -> Pipeline:
+    """One that tells at once, and one on ids 0x200 higher that tells so much later."""
+    slow = COUNTED[COUNTED.index("[[sensor]]") :].replace('"tiny"', '"slow"', 1)
+    keys = f"latency_s = {latency_s}\narbitration_id_offset = 0x200\ntimeout_s"
+    profile = profile_of(folder, COUNTED + slow.replace("timeout_s", keys, 1))
+    return Pipeline(profile, shipped_predictor())
+
+
+def of_both(step: int, prompt: Sequence[int], slow: Sequence[int] | None) -> list[can.Message]:
+    """Object lists of both sensors 50 ms apart, ten a second; None = the slow one is silent."""
+    messages = []
+    for offset, late_s, numbers in ((0, 0.0, prompt), (0x200, 0.05, slow)):
+        for message in (
+            []
+            if numbers is None
+            else [
+                header(len(numbers), step % 16),
+                *(first(20.0 + n, 0.0, n, counter=step % 16) for n in numbers),
+            ]
+        ):
+            message.arbitration_id += offset
+            message.timestamp = 100.0 + step / 10 + late_s
+            messages.append(message)
+    return messages
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.2, 0.25, 0.3, 0.35, 0.9])
+def test_objects_of_a_sensor_that_tells_later_are_predicted_in_every_cycle(
+    tmp_path: Path, latency_s: float
+) -> None:
+    """From its own newest cycle, and their age is told."""
+    pipeline = two_sensors(tmp_path, latency_s)
+    made = [f for step in range(40) for f in feed(pipeline, of_both(step, [1], [2]))][-20:]
+    assert [f.timestamp_s for f in made] == pytest.approx(102.0 + np.arange(20) / 10, abs=1e-6)
+    for forecast in made:
+        anchor_s = dict(zip(forecast.object_id.tolist(), forecast.anchor_s, strict=True))
+        assert anchor_s[1] == pytest.approx(forecast.timestamp_s, abs=1e-6)
+        assert anchor_s[2] == pytest.approx(forecast.timestamp_s - 0.05 - latency_s, abs=1e-6)
+        assert (forecast.age_s == forecast.made_s - forecast.anchor_s).all()
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.35])
+@pytest.mark.parametrize("slow", [[], None], ids=["lists it no more", "falls silent"])
+def test_what_a_sensor_has_not_seen_for_three_tenths_of_a_second_goes_however_late_it_tells(
+    tmp_path: Path, latency_s: float, slow: list[int] | None
+) -> None:
+    """Last seen in the cycle that comes at 102.05 s: there until 102.3, not at 102.4."""
+    pipeline = two_sensors(tmp_path, latency_s)
+    messages = [m for step in range(21) for m in of_both(step, [1], [2])]
+    messages += [m for step in range(21, 30) for m in of_both(step, [1], slow)]
+    present = [f.timestamp_s for f in feed(pipeline, messages) if 2 in f.object_id]
+    assert max(present) == pytest.approx(102.3, abs=1e-6)
 
 
 def test_silence_is_said_after_three_periods_and_then_every_period() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -33,6 +34,83 @@ def test_two_sources_of_latitude_and_longitude_are_refused(tmp_path: Path) -> No
     )
     with pytest.raises(ProfileError, match=r"more than one \[\[ego\]\] gives latitude and long"):
         profile_of(tmp_path, 'description = "two"\n' + ego + ego)
+
+
+MOTION = """
+[[ego]]
+bus = "car"
+dbc = "tiny.dbc"
+messages = { ego = "EGO" }
+latency_s = MOTION_S
+fields = { speed = "LEFT", yaw_rate = "YAW_RATE" }
+"""
+POSE = """
+[[ego]]
+bus = "car"
+dbc = "tiny.dbc"
+messages = { pose = "EGO" }
+latency_s = POSE_S
+
+[ego.fields]
+x = { signal = "LEFT", unit = "m" }
+y = { signal = "RIGHT", unit = "m" }
+yaw = { signal = "YAW_RATE", unit = "deg" }
+"""
+
+
+def late(sensor_s: float, motion_s: float | None = None, pose_s: float | None = None) -> str:
+    """A profile whose sources have these latencies; None = there is none."""
+    text = COUNTED.replace("timeout_s", f"latency_s = {sensor_s}\ntimeout_s", 1)
+    text += "" if motion_s is None else MOTION.replace("MOTION_S", str(motion_s))
+    return text + ("" if pose_s is None else POSE.replace("POSE_S", str(pose_s)))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (late(1.0), "sensor[0]: latency_s is 1.0, expected 0 to below 1: older input is not used"),
+        (late(math.nan), "sensor[0]: latency_s is nan, expected 0 to below 1"),
+        (late(-0.1), "sensor[0]: latency_s is -0.1, expected 0 to below 1"),
+        (late(0.9, 1.5), "ego[0]: latency_s is 1.5, expected 0 to below 1: older input is not"),
+        (
+            late(0.0, 0.25),
+            "ego[0]: latency_s is 0.25, expected at most 0.2: the sensor 'tiny' has latency_s = 0, "
+            "and the ego motion is extrapolated for 0.2 s at most",
+        ),
+        (late(0.1, 0.31), "ego[0]: latency_s is 0.31, expected at most 0.3: the sensor 'tiny' has"),
+        (late(0.0, None, 0.25), "ego[0]: latency_s is 0.25, expected at most 0.2: the sensor"),
+        (
+            late(0.0, 0.1, 0.55),
+            "ego[1]: latency_s is 0.55, expected at most 0.5: the sensor 'tiny' has latency_s = 0, "
+            "and a pose is believed for 0.5 s at most",
+        ),
+    ],
+)
+def test_a_latency_that_can_never_work_is_refused(
+    tmp_path: Path, text: str, complaint: str
+) -> None:
+    with pytest.raises(ProfileError) as refusal:
+        profile_of(tmp_path, text)
+    assert f"tiny.toml: {complaint}" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "latencies",
+    [
+        pytest.param((0.99,), id="the sensor alone"),
+        pytest.param((0.0, 0.2), id="the ego motion, as long as it is extrapolated"),
+        pytest.param((0.7, 0.9), id="as much later as the sensor"),
+        pytest.param((0.0, 0.0, 0.5), id="a pose to which dead reckoning adds"),
+        pytest.param((0.3, None, 0.5), id="a pose alone"),
+    ],
+)
+def test_a_latency_that_may_work_is_taken(
+    tmp_path: Path, latencies: tuple[float | None, ...]
+) -> None:
+    loaded = profile_of(tmp_path, late(*latencies))  # type: ignore[arg-type]  # the first is a number
+    found = [loaded.sensors[0].latency_s, *(ego.latency_s for ego in loaded.ego)]
+    assert found == [latency_s for latency_s in latencies if latency_s is not None]
 
 
 def test_a_profile_is_loaded_from_a_path(tmp_path: Path) -> None:

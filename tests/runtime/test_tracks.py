@@ -232,6 +232,35 @@ def test_a_full_store_forgets_the_stalest_track() -> None:
     assert store.counters.dropped == 1
 
 
+def test_a_full_store_forgets_no_track_that_may_go_on() -> None:
+    """Object 1 was seen 0.3 s ago: object 4 has to wait for the next cycle."""
+    store = TrackStore(capacity=3)
+    store.update(see(1.0, {n: (10.0 * n, 0.0) for n in (1, 2, 3)}), standing(), AT_ORIGIN)
+    for time_s, there in ((1.3, {1: 1, 2: 2, 3: 3}), (1.35, {2: 2, 3: 3, 4: 4})):
+        seen = {n: (10.0 * n, 0.0) for n in (2, 3, 4)}
+        store.update(see(time_s, seen), standing(), AT_ORIGIN)
+        assert ids_by_object(store, time_s) == there
+    assert store.counters.dropped == 2
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.35])
+def test_sensors_with_too_many_objects_do_not_drive_out_each_others(late_s: float) -> None:
+    """300 that stand still, and room for 256: those that came first have full histories."""
+    store = TrackStore()
+    for k in range(30):
+        for n, sensor in enumerate(("front", "left", "right")):
+            time_s = 0.1 * k + 0.01 * n
+            seen = {i: (10.0 + i, 5.0 * n) for i in range(100)}
+            cycle = see(time_s - n * late_s, seen, sensor=sensor)
+            store.update(replace(cycle, received_s=time_s), standing(), AT_ORIGIN)
+    tracks = store.snapshot(2.9)
+    assert store.counters.tracks == len(tracks.row) == 256
+    assert store.counters.dropped == 30 * (300 - 256)
+    for anchor_s in np.unique(tracks.timestamp_s):
+        _, valid = store.history(anchor_s, 20, 0.1, tracks.row)
+        assert valid[tracks.timestamp_s == anchor_s].all()
+
+
 def test_more_objects_than_the_store_holds_leave_those_that_came_first() -> None:
     store = TrackStore(capacity=3)
     store.update(see(1.0, {2: (10.0, 0.0)}), standing(), AT_ORIGIN)
@@ -253,7 +282,7 @@ def test_a_snapshot_shows_what_was_seen_lately() -> None:
 @given(data=st.data())
 def test_no_history_ever_mixes_two_objects(data: st.DataObject) -> None:
     """Twelve objects, 60 m apart, wander under four ids that are dealt anew without any flag."""
-    store, time_s = TrackStore(capacity=8, depth=16), 100.0
+    store, time_s = TrackStore(capacity=8), 100.0
     for _ in range(data.draw(st.integers(5, 40))):
         time_s += data.draw(st.sampled_from([0.0, 0.02, 0.05, 0.1, 0.29, 0.31, 2.5]))
         dealt = data.draw(st.dictionaries(st.integers(0, 3), st.integers(0, 11), max_size=4))
@@ -462,15 +491,69 @@ def test_every_track_ends_on_its_own_measurement_when_the_clock_is_anchored_ther
         np.testing.assert_allclose(speed, 1.0)
 
 
-def test_the_ring_keeps_its_newest_measurements() -> None:
-    store = TrackStore(depth=16)
-    for k in range(100):
-        store.update(see(k * 0.1, {1: (10.0 + 0.5 * k, 0.0)}), standing(), AT_ORIGIN)
-    tracks = store.snapshot(9.9)
-    positions, valid = store.history(9.9, 20, 0.1, tracks.row)
-    np.testing.assert_array_equal(valid, [[False] * 4 + [True] * 16])
-    np.testing.assert_allclose(positions[0, 4:, 0], 10.0 + 0.5 * np.arange(84, 100))
-    np.testing.assert_array_equal(tracks.num_measurements, [100])
+def followed_for(store: TrackStore, times_s: Sequence[float]) -> None:
+    """An object that drives 10 m/s and is seen at these times."""
+    for time_s in times_s:
+        store.update(see(time_s, {1: (10.0 * time_s, 0.0)}), standing(), AT_ORIGIN)
+
+
+@pytest.mark.parametrize(("steps", "dt_s"), [(20, 0.1), (50, 0.1), (40, 0.05), (5, 0.5), (1, 0.1)])
+@pytest.mark.parametrize("rate_hz", [5, 10, 14, 20, 24, 26, 33, 40, 50, 77, 100, 400])
+def test_a_history_reaches_as_far_back_as_the_model_asks_however_fast_the_sensor_is(
+    rate_hz: int, steps: int, dt_s: float
+) -> None:
+    """On the clock of a target that was last seen 0.3 s before the newest measurement, too."""
+    store = TrackStore(steps, dt_s)
+    past_s = max(1.0, (steps - 1) * dt_s) + 1.0
+    times_s = [k / rate_hz for k in range(round(past_s * rate_hz) + 1)]
+    followed_for(store, times_s)
+    tracks = store.snapshot(times_s[-1])
+    assert tracks.timestamp_s == times_s[-1]
+    assert tracks.num_measurements == len(times_s)
+    for now_s in (times_s[-1], times_s[-1] - 0.3):
+        clock_s = now_s - dt_s * np.arange(steps - 1, -1, -1)
+        positions, valid = store.history(now_s, steps, dt_s, tracks.row)
+        near_s = np.abs(np.subtract.outer(clock_s, times_s)).min(axis=1)
+        np.testing.assert_array_equal(valid[0], near_s <= dt_s + 1e-6)
+        np.testing.assert_allclose(positions[0, valid[0], 0], 10.0 * clock_s[valid[0]])
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    gaps_s=st.lists(st.floats(0.001, 0.35), min_size=1, max_size=300),
+    dt_s=st.sampled_from([0.02, 0.05, 0.1, 0.5]),
+)
+def test_thinning_takes_no_step_away_and_widens_no_gap_that_matters(
+    gaps_s: list[float], dt_s: float
+) -> None:
+    """A weaving object: as if all since its track began were kept, to what it moves in 80 ms."""
+    steps, times_s = 20, np.cumsum(gaps_s)
+    places = np.stack([10.0 * times_s, np.sin(2.0 * times_s)], axis=1)
+    store = TrackStore(steps, dt_s)
+    for time_s, place in zip(times_s.tolist(), places.tolist(), strict=True):
+        store.update(see(time_s, {1: tuple(place)}), standing(), AT_ORIGIN)
+    tracks, now_s = store.snapshot(times_s[-1]), float(times_s[-1])
+    count = int(tracks.num_measurements[0])
+    positions, valid = store.history(now_s, steps, dt_s, tracks.row)
+    whole, known = resample(times_s[None, -count:], places[None, -count:], now_s, steps, dt_s)
+    np.testing.assert_array_equal(valid, known)
+    np.testing.assert_array_equal(positions[0, -1], places[-1])
+    np.testing.assert_allclose(positions[valid], whole[valid], atol=4.0 * 0.08**2 / 8 + 1e-9)
+    if min(gaps_s) > 0.0401:
+        np.testing.assert_array_equal(positions[valid], whole[valid])
+
+
+def test_a_store_can_be_made_ready_for_longer_histories() -> None:
+    """What it knows stays; a model that reads less later takes nothing away."""
+    store = TrackStore(20, 0.1)
+    times_s = [k / 20 for k in range(201)]
+    followed_for(store, times_s[:101])
+    store.reach(50, 0.1)
+    followed_for(store, times_s[101:])
+    store.reach(20, 0.1)
+    positions, valid = store.history(10.0, 50, 0.1, store.snapshot(10.0).row)
+    assert valid.all()
+    np.testing.assert_allclose(positions[0, :, 0], 10.0 * (10.0 - 0.1 * np.arange(49, -1, -1)))
 
 
 # --- a real drive -----------------------------------------------------------------------------

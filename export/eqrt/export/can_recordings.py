@@ -58,7 +58,7 @@ NO_VEHICLES = (
     ObjectClass.STATIC,
 )
 EGO_ID = "ego"
-_STEPS_AT_ONCE = 5  # of a future; the tracker keeps 2 s of a lost track, and 64 measurements
+_STEPS_AT_ONCE = 5  # of a future; the tracker keeps a lost track for 2 s
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -19,6 +19,7 @@ from eqrt.core.lane_choice import centerline_source
 from eqrt.core.scene import CenterlineSource
 from eqrt.runtime.decoding.can_io import Decoder, Event
 from eqrt.runtime.decoding.detections import Detections, EgoMotion, EgoPose
+from eqrt.runtime.decoding.latency_checks import MAX_INPUT_AGE_S
 from eqrt.runtime.decoding.profile import Profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.prediction.forecaster import Deadline, Forecaster, Raw
@@ -28,20 +29,22 @@ from eqrt.runtime.prediction.targets import Targets
 from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.prediction.watched import Direct, Model, Runner, Watched
 from eqrt.runtime.tracking.ego import EgoState, EgoTracker
+from eqrt.runtime.tracking.track_history import MAX_GAP_S
 from eqrt.runtime.tracking.tracks import TrackStore
 
+SENSOR_TRACKS = 256
+"""There is room for so many objects at a time, times the number of sensors: sensors count theirs in
+eight bits."""
 MIN_PERIOD = 0.6
 """Cycles closer together than this many model steps share a prediction: radars send up to 20 Hz."""
-TARGET_AGE_S = 0.3
-"""A track unseen for longer is not predicted any more."""
+TARGET_AGE_S = MAX_GAP_S
+"""A track unseen for longer is not predicted any more. How much later than those of other sensors
+its sensor's cycles come is not held against it."""
 NEIGHBOR_AGE_S = 0.5
 """A track unseen for longer does not stand in any target's scene: `scene.RECENT_STEPS`."""
 SHED_PERIODS = 0.7
 """Of the model's period, counted from the arrival of a cycle's last message: what could not be
 predicted by then is left to physics, so that the rest leaves in time and nothing queues up."""
-MAX_INPUT_AGE_S = 1.0
-"""Input that is older when it comes is not used: sensors may say how old their measurements are,
-and a bit that is flipped there must not undo everything that came since."""
 SILENT_PERIODS = 3
 """After this many model steps without a prediction, everything said before is void."""
 _FINISH_S = 1.0  # longer than any profile's timeout
@@ -107,7 +110,8 @@ class Pipeline:
             yaw_rate_bias_rad_s=profile.yaw_rate_bias_rad_s,
             stationary=stationary or not profile.has_ego,
         )
-        self.tracks = TrackStore()
+        steps, dt_s = predictor.contract.history_steps, predictor.contract.dt_s
+        self.tracks = TrackStore(steps, dt_s, capacity=SENSOR_TRACKS * len(profile.sensors))
         self.counters = PipelineCounters()
         self.times = StageTimes()
         self.profile = profile
@@ -159,6 +163,7 @@ class Pipeline:
         origin = tile.info.origin_deg if tile else None
         self.predictor, self.tile = predictor, tile
         self._runner = self._runner.succeeded_by(predictor)
+        self.tracks.reach(predictor.contract.history_steps, predictor.contract.dt_s)
         self._forecaster = Forecaster(
             predictor.contract, self._runner, lanes, self.tracks, self.ego
         )
@@ -197,7 +202,7 @@ class Pipeline:
 
     def _predict(self, ego: EgoState | None, moment: _Moment) -> ForecastSet:
         tracks = self.tracks.snapshot(moment.measured_s, NEIGHBOR_AGE_S)
-        alive = tracks.timestamp_s >= moment.measured_s - TARGET_AGE_S
+        alive = tracks.timestamp_s >= tracks.told_until_s - TARGET_AGE_S
         if ego is None or not alive.any():
             return self._forecast(self._nobody, ego, moment)
         raw = self._forecaster.predict(tracks, alive, ego, self._deadline(moment))

@@ -147,8 +147,6 @@ def _check(table: EgoTable, where: str) -> None:
         problem = "there are two poses; give x, y, yaw or latitude, longitude, heading"
     elif fields.reverse is not None and fields.speed is None:
         problem = "fields.reverse turns fields.speed around, which is missing"
-    elif not 0.0 <= table.latency_s <= MAX_TIME_S:
-        problem = f"latency_s is {table.latency_s}, expected 0 to {MAX_TIME_S:g}"
     elif not 0.0 < table.hold_s <= MAX_TIME_S:
         problem = f"hold_s is {table.hold_s}, expected above 0 to {MAX_TIME_S:g}"
     elif table.silence_s is not None and not 0.0 < table.silence_s <= MAX_TIME_S:

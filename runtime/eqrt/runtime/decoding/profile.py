@@ -14,6 +14,7 @@ from pathlib import Path
 from eqrt.core.errors import ProfileError
 from eqrt.runtime.decoding.dbc_files import Dbc, load_dbc
 from eqrt.runtime.decoding.ego_profile import EgoProfile, bind_ego
+from eqrt.runtime.decoding.latency_checks import check_latencies
 from eqrt.runtime.decoding.profile_schema import ProfileTable
 from eqrt.runtime.decoding.sensor_binding import bind_sensor
 from eqrt.runtime.decoding.sensor_profile import SensorProfile
@@ -78,6 +79,7 @@ def load_profile(name_or_path: str) -> Profile:
     table = read_toml(path, ProfileTable)
     if problem := _problem(table):
         raise ProfileError(f"{path}: {problem}")
+    check_latencies(table, str(path))
     dbc_at = cache(load_dbc)  # sensor and ego often share one
 
     def dbc(name: str) -> Dbc:

@@ -12,7 +12,7 @@ SLOT_ID = "slot"
 """The `id` of objects that are known by their slot."""
 
 MAX_TIME_S = 10.0
-"""Of timeouts and latencies; more is a slip of the unit."""
+"""Of timeouts; more is a slip of the unit."""
 
 
 def check_sensor(table: SensorTable, where: str) -> None:
@@ -91,8 +91,6 @@ def _numbers(table: SensorTable) -> list[str]:
         )
     if not 0.0 < table.timeout_s <= MAX_TIME_S:
         problems.append(f"timeout_s is {table.timeout_s}, expected above 0 to {MAX_TIME_S:g}")
-    if not 0.0 <= table.latency_s <= MAX_TIME_S:
-        problems.append(f"latency_s is {table.latency_s}, expected 0 to {MAX_TIME_S:g}")
     mount = table.mount
     if not all(map(math.isfinite, (mount.x_m, mount.y_m, mount.yaw_deg))):
         problems.append("mount must be finite numbers")

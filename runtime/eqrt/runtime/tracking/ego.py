@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
+from eqrt.runtime.decoding.latency_checks import MAX_EXTRAPOLATION_S, MAX_POSE_AGE_S
 from eqrt.runtime.tracking.ego_calibration import SpeedScale, Standstill, YawRateBias
-from eqrt.runtime.tracking.odometry import MAX_EXTRAPOLATION_S, Odometry, OdometryState
+from eqrt.runtime.tracking.odometry import Odometry, OdometryState
 from eqrt.runtime.tracking.pose_track import PoseTrack
 
 _MAX_SPEED_MPS = 100.0
@@ -70,7 +71,7 @@ class EgoTracker:
         yaw_rate_bias_rad_s: float = 0.0,
         speed_scale: float = 1.0,
         stationary: bool = False,
-        max_pose_age_s: float = 0.5,
+        max_pose_age_s: float = MAX_POSE_AGE_S,
     ) -> None:
         self.counters = EgoCounters()
         self.yaw_rate_bias = YawRateBias(yaw_rate_bias_rad_s)

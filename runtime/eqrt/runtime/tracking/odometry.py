@@ -13,10 +13,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from eqrt.core.frames import Pose2
+from eqrt.runtime.decoding.latency_checks import MAX_EXTRAPOLATION_S
 from eqrt.runtime.tracking.arcs import arc, between
 
-MAX_EXTRAPOLATION_S = 0.2
-"""How far past the time when both signals were last known their values are held."""
 MAX_GAP_S = 1.0
 """A signal silent for longer, or a clock that steps by more, breaks the dead reckoning."""
 KEPT_S = 10.0

@@ -13,8 +13,8 @@ MAX_GAP_S = 0.3
 """Two measurements further apart are not joined."""
 SAME_TIME_S = 1e-6
 """Times closer than this are equal: float64 resolves a clock that counts from 1970 to 0.24 us."""
-
-_FIT_S = 1.0
+FIT_S = 1.0
+"""A velocity is fitted to so much of the newest past."""
 _FIT_MIN_S = 0.2
 _FIT_MIN_COUNT = 3
 
@@ -58,9 +58,9 @@ def fit_velocity(times_s: Float64, positions: Float64) -> Float64:
     `times_s` is (A, R), `positions` (A, R, 2), with at least one measurement each.
     """
     newest_s = times_s[:, -1:]
-    old = _num_older(times_s - newest_s, -_FIT_S)
+    old = _num_older(times_s - newest_s, -FIT_S)
     age_s = times_s[:, old:] - newest_s
-    used = age_s >= -_FIT_S  # (A, R)
+    used = age_s >= -FIT_S  # (A, R)
     count = used.sum(-1)
     age_s = np.where(used, age_s, 0.0)
     age_s = np.where(used, age_s - (age_s.sum(-1) / count)[:, None], 0.0)

@@ -6,20 +6,26 @@ jumps. Each gets a `track_id` that never comes again. Detections are placed in t
 their own time, so that the ego's motion is gone from the histories.
 
 Everything lives in arrays of fixed size: rows for tracks, right-aligned columns for measurements.
+A measurement without which the gap around it stays short is not kept once the next one comes, so
+that the columns reach as far back as the model asks, however fast the sensor measures.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.detections import Detections
+from eqrt.runtime.decoding.latency_checks import MAX_INPUT_AGE_S
 from eqrt.runtime.tracking.ego import EgoState
 from eqrt.runtime.tracking.measurements import Measurements, measure
 from eqrt.runtime.tracking.track_history import (
+    FIT_S,
     MAX_GAP_S,
     SAME_TIME_S,
     Float64,
@@ -36,6 +42,10 @@ _JUMP_M = 2.0  # the reflection wanders over a vehicle
 _JUMP_PER_RANGE = 0.02  # 1.1 degrees of bearing noise
 _JUMP_KNOWN_MPS = 15.0  # how wrong a velocity fitted or measured may be
 _JUMP_UNKNOWN_MPS = 80.0  # faster over ground than anything on a road
+_MAX_THINNED_S = 0.08
+"""No gap gets longer by thinning than this; what comes at up to 20 Hz is kept whole."""
+_THINNED_STEPS = 0.8
+"""Nor than this many of the model's steps."""
 _NO_ROW = -1
 
 Index = NDArray[np.intp]
@@ -56,6 +66,9 @@ class Tracks:
     """(M,) as the sensor numbers it."""
     timestamp_s: Float64
     """(M,) of the last measurement."""
+    told_until_s: Float64
+    """(M,) up to when its sensor has told: the time of the snapshot, less what the sensor's cycles
+    lag behind others'. From `timestamp_s` to then they were without it."""
     position: Float64
     """(M, 2) metres, the last measurement."""
     velocity: Float64
@@ -98,28 +111,41 @@ class TrackCounters:
     without_ego: int = 0
     """Cycles at whose time the ego's pose is not known: ignored."""
     dropped: int = 0
-    """Tracks forgotten, or not begun, because the store was full."""
+    """Tracks forgotten, and detections that began none, because the store was full."""
     resets: int = 0
     """Times that all tracks were forgotten: the map frame jumped or the clock was set back."""
 
 
-class TrackStore:
-    """Up to `capacity` tracks of up to `depth` measurements each."""
+class _Cycle(NamedTuple):
+    """When a sensor's newest cycle was measured, and when it came."""
 
-    def __init__(self, *, capacity: int = 256, depth: int = 64) -> None:
+    timestamp_s: float = -np.inf
+    received_s: float = 0.0
+
+
+class TrackStore:
+    """Up to `capacity` tracks, known as far back as a model's history of `steps` at `dt_s` reaches.
+
+    When it is full, a new object takes the place of one that its sensor lists no more; if there is
+    none, it has to wait, so that sensors with too many objects do not drive out each other's.
+    """
+
+    def __init__(self, steps: int = 20, dt_s: float = 0.1, *, capacity: int = 256) -> None:
         self.counters = TrackCounters()
         self.sensors: list[str] = []
         """Names, in order of appearance."""
         self._next_track_id = 1
         self._ego_epoch: int | None = None
         self._newest_s = -np.inf
+        self._cycles: list[_Cycle] = []  # the newest of each sensor
+        self._behind_s = np.zeros(1)  # (sensors,) see `_hear`
         self._used = np.zeros(capacity, np.bool_)
         self._sensor = np.zeros(capacity, np.intp)
         self._object_id = np.zeros(capacity, np.int64)
         self._track_id = np.zeros(capacity, np.int64)
         self._count = np.zeros(capacity, np.int64)
-        self._times_s = np.full((capacity, depth), -np.inf)
-        self._positions = np.full((capacity, depth, 2), np.nan)
+        self._times_s = np.full((capacity, 1), -np.inf)
+        self._positions = np.full((capacity, 1, 2), np.nan)
         self._fitted_velocity = np.full((capacity, 2), np.nan)
         self._velocity = np.full((capacity, 2), np.nan)
         self._heading_rad = np.full(capacity, np.nan)
@@ -127,6 +153,21 @@ class TrackStore:
         self._width_m = np.full(capacity, np.nan)
         self._existence = np.full(capacity, np.nan)
         self._object_class = np.zeros(capacity, np.uint8)
+        self.reach(steps, dt_s)
+
+    def reach(self, steps: int, dt_s: float) -> None:
+        """From now on, be ready for histories of `steps` at `dt_s`; what is known stays.
+
+        Of any three measurements kept, the outer two are further apart than `_thinned_s`: that says
+        how many columns are enough, also for the first step of a neighbor, on the clock of the
+        target whose sensor tells last.
+        """
+        self._thinned_s = min(_MAX_THINNED_S, _THINNED_STEPS * dt_s)
+        past_s = max((steps - 1) * dt_s, FIT_S) + 2.0 * MAX_GAP_S + MAX_INPUT_AGE_S
+        depth = 2 * math.ceil(past_s / self._thinned_s) + 1
+        more = (0, 0), (max(0, depth - self._times_s.shape[1]), 0)
+        self._times_s = np.pad(self._times_s, more, constant_values=-np.inf)
+        self._positions = np.pad(self._positions, (*more, (0, 0)), constant_values=np.nan)
 
     def update(self, detections: Detections, ego: EgoState | None, ego_from_sensor: Pose2) -> None:
         """Take one cycle, measured from `ego` (the state at its timestamp)."""
@@ -136,7 +177,7 @@ class TrackStore:
             return
         now_s = detections.timestamp_s
         self._advance(now_s, ego.epoch)
-        sensor = self._sensor_index(detections.sensor)
+        sensor = self._hear(detections)
         found = self._admit(measure(detections, ego, ego_from_sensor))
         row = self._match(sensor, found.object_id)
         on_time = (row == _NO_ROW) | (self._times_s[row, -1] < now_s)
@@ -151,8 +192,12 @@ class TrackStore:
         self._append(row, now_s, found)
 
     def snapshot(self, now_s: float, max_age_s: float = MAX_GAP_S) -> Tracks:
-        """The tracks whose last measurement is at most `max_age_s` old (or after `now_s`)."""
-        row = np.flatnonzero(self._used & (self._times_s[:, -1] >= now_s - max_age_s - SAME_TIME_S))
+        """The tracks whose sensors were at most `max_age_s` without them at `now_s`, the time of a
+        cycle.
+        """
+        told_until_s = self._told_until_s(now_s)
+        is_recent = self._times_s[:, -1] >= told_until_s - max_age_s - SAME_TIME_S
+        row = np.flatnonzero(self._used & is_recent)
         velocity = self._velocity[row]
         speed_mps = np.hypot(velocity[:, 0], velocity[:, 1])
         fitted = self._fitted_velocity[row]
@@ -163,6 +208,7 @@ class TrackStore:
             sensor=self._sensor[row],
             object_id=self._object_id[row],
             timestamp_s=self._times_s[row, -1],
+            told_until_s=told_until_s[row],
             position=self._positions[row, -1],
             velocity=velocity,
             speed_mps=speed_mps,
@@ -195,11 +241,31 @@ class TrackStore:
     def _clear(self) -> None:
         self.counters.resets += bool(self._used.any())
         self._used[:] = False
+        self._cycles = [_Cycle()] * len(self.sensors)
 
-    def _sensor_index(self, name: str) -> int:
-        if name not in self.sensors:
-            self.sensors.append(name)
-        return self.sensors.index(name)
+    def _hear(self, detections: Detections) -> int:
+        """Note a sensor's cycle, and how far each sensor's cycles lag behind the newest of all.
+
+        Counted as if each sensor had gone on since its last cycle came, so that one that falls
+        silent does not seem to lag more and more.
+        """
+        if detections.sensor not in self.sensors:
+            self.sensors.append(detections.sensor)
+            self._cycles.append(_Cycle())
+        sensor = self.sensors.index(detections.sensor)
+        if detections.timestamp_s > self._cycles[sensor].timestamp_s:
+            self._cycles[sensor] = _Cycle(detections.timestamp_s, detections.received_s)
+        behind_s = [
+            self._newest_s - (cycle.timestamp_s + (detections.received_s - cycle.received_s))
+            for cycle in self._cycles
+        ]
+        self._behind_s = np.array([min(max(0.0, lag_s), MAX_INPUT_AGE_S) for lag_s in behind_s])
+        return sensor
+
+    def _told_until_s(self, now_s: float) -> Float64:
+        """Of every row, see `Tracks.told_until_s`."""
+        told_until_s: Float64 = now_s - self._behind_s[self._sensor]
+        return told_until_s
 
     def _admit(self, found: Measurements) -> Measurements:
         """Those with a possible position and an id of their own."""
@@ -237,13 +303,17 @@ class TrackStore:
         return same
 
     def _with_room(self, row: Index) -> Index:
-        """Rows (D,) with a row for each new object too, at the cost of the stalest tracks."""
+        """Rows (D,) with a row for each new object too, as long as there are any.
+
+        The stalest tracks make room, of those that cannot go on any more.
+        """
         needed = int(np.count_nonzero(row == _NO_ROW))
         free = np.flatnonzero(~self._used)
         if needed > len(free):
             self.counters.dropped += needed - len(free)
-            in_use = np.setdiff1d(np.flatnonzero(self._used), row)
-            stalest = in_use[np.argsort(self._times_s[in_use, -1], kind="stable")]
+            has_ended = self._times_s[:, -1] < self._told_until_s(self._newest_s) - MAX_GAP_S
+            ended = np.setdiff1d(np.flatnonzero(self._used & has_ended), row)
+            stalest = ended[np.argsort(self._times_s[ended, -1], kind="stable")]
             free = np.concatenate([free, stalest])
         row = row.copy()
         wanting = np.flatnonzero(row == _NO_ROW)[: len(free)]
@@ -262,9 +332,11 @@ class TrackStore:
         self.counters.tracks += len(row)
 
     def _append(self, row: Index, now_s: float, found: Measurements) -> None:
-        self._times_s[row, :-1] = self._times_s[row, 1:]
+        # The last one gives way to this one if the gap that this leaves is short.
+        keeps = row[now_s - self._times_s[row, -2] > self._thinned_s]
+        self._times_s[keeps, :-1] = self._times_s[keeps, 1:]
         self._times_s[row, -1] = now_s
-        self._positions[row, :-1] = self._positions[row, 1:]
+        self._positions[keeps, :-1] = self._positions[keeps, 1:]
         self._positions[row, -1] = found.position
         self._fitted_velocity[row] = fit_velocity(self._times_s[row], self._positions[row])
         self._velocity[row] = found.velocity
