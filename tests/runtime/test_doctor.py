@@ -16,7 +16,14 @@ import can
 from drives import DRIVES, TILE, first_seconds
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
-from eqrt.runtime.doctor.bus import Traffic, judge_link, judge_load, parse_link
+from eqrt.runtime.doctor.bus import (
+    Traffic,
+    judge_link,
+    judge_load,
+    judge_room,
+    parse_link,
+    room_of,
+)
 from eqrt.runtime.doctor.finding import Finding, Verdict
 from eqrt.runtime.operation.endpoint import Endpoint
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
@@ -166,6 +173,16 @@ def test_a_bus_that_is_nearly_full_is_a_warning() -> None:
 
     assert (full(2000).verdict, full(4000).verdict) == (Verdict.OK, Verdict.WARN)
     assert "89% of the bitrate" in full(4000).found
+
+
+def test_an_interface_that_takes_less_than_a_cycle_is_a_warning() -> None:
+    """10 messages unless told otherwise; a virtual one may have no queue at all."""
+    found = judge_room("room can0", "can0", 10)
+    assert found.verdict is Verdict.WARN
+    assert found.advice == "sudo ip link set can0 txqueuelen 1000"
+    assert [judge_room("room can0", "can0", room).verdict for room in (0, 1000)] == [Verdict.OK] * 2
+    assert isinstance(room_of("lo"), int)
+    assert room_of("nowhere0") is None
 
 
 def test_error_frames_are_a_warning() -> None:

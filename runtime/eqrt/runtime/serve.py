@@ -216,8 +216,8 @@ def _publishers(
 ) -> list[Publisher]:
     publishers: list[Publisher] = []
     if (out := _out_channel(args)) is not None:
-        bus = receiver.connection(out)
-        publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
+        outbox = receiver.connection(out).outbox
+        publishers.append(CanPublisher(outbox, base_id=args.out_id, num_modes=args.out_modes))
     elif not args.datagrams and not args.record:
         raise UsageError(
             "--out-can none, no --datagrams, no --record: the predictions would go nowhere"
