@@ -7,6 +7,7 @@ import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from operator import eq
 from typing import Any
 
 import can
@@ -499,3 +500,19 @@ def test_the_checks_of_32_objects_are_computed_within_the_budget(
     benchmark.pedantic(protect_all, rounds=500, warmup_rounds=20)
     if benchmark.enabled:
         assert np.quantile(benchmark.stats.stats.data, 0.99) < PROTECTION_BUDGET_S
+
+
+def test_the_bases_whose_data_ids_clash_are_those_that_the_documentation_names() -> None:
+    """Of two services on one bus; ids that are the same are another matter."""
+
+    def clash(base: int, other: int) -> tuple[bool, bool]:
+        """On classic CAN, on CAN FD."""
+        fd, classic = [Offset.STATUS, Offset.TRAJECTORY], [o for o in Offset if o >= 2]
+        twos = [[data_ids_of(one + offset) for offset in classic] for one in (base, other)]
+        fives = [{data_id_of(one + offset) for offset in fd} for one in (base, other)]
+        pairs = itertools.product(*twos)
+        return any(any(map(eq, *pair)) for pair in pairs), bool(fives[0] & fives[1])
+
+    for apart in (*range(6, 0x300), *range(0xFFF0, 0x10010)):
+        expected = (min(apart % 0x100, -apart % 0x100) <= 3, min(apart, abs(apart - 0x10000)) <= 1)
+        assert clash(BASE_ID, BASE_ID + apart) == expected, hex(apart)
