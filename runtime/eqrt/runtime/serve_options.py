@@ -78,8 +78,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out-modes",
-        type=int,
-        default=1,
+        type=ModeCount,
+        default=ModeCount(1),
         metavar="N",
         help="modes of each object sent on CAN FD, most probable first (default 1)",
     )
@@ -177,6 +177,21 @@ def add_pipeline_arguments(parser: argparse.ArgumentParser, *, of_recordings: bo
         action=Switch,
         help="the sensor stands still: predict although no message tells its motion",
     )
+
+
+class ModeCount(int):
+    """How many modes of each object are sent."""
+
+    __slots__ = ()
+
+    def __new__(cls, text: str | int) -> ModeCount:
+        """argparse.ArgumentTypeError if that is not a number, or none at all."""
+        try:
+            if (count := int(text)) >= 1:
+                return super().__new__(cls, count)
+        except ValueError:
+            pass
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of modes; give 1 or more")
 
 
 class ArbitrationId(int):
