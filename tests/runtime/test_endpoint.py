@@ -17,7 +17,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from drives import Car, cycle, shipped_predictor
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import AddressError, UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.links import opener
@@ -35,7 +35,7 @@ from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.status_book import StatusBook
-from processes import PATIENCE_S, Serving
+from processes import PATIENCE_S, Serving, eqrt
 from source_tree import ROOT
 
 STATES = ("UP", "ERROR_PASSIVE", "BUS_OFF", "DOWN")
@@ -190,8 +190,19 @@ def test_another_place_can_be_allowed() -> None:
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
-    with Endpoint("127.0.0.1:0") as first, pytest.raises(UsageError, match="cannot listen there"):
+    with Endpoint("127.0.0.1:0") as first, pytest.raises(AddressError, match="cannot listen there"):
         Endpoint(first.address)
+
+
+def test_what_may_change_ends_a_service_so_that_it_is_started_again() -> None:
+    """Status 1: a port that is taken, an address that is not up yet. 2 keeps the unit down."""
+    serve = ["serve", "--can", f"port-{time.monotonic_ns()}", "--can-interface", LOCAL]
+    serve += ["--profile", "ars408", "--metrics-anywhere", "--metrics"]
+    with Endpoint("127.0.0.1:0") as taken:
+        for address, status in ((taken.address, 1), ("192.0.2.7:9464", 1), ("nowhere", 2)):
+            done = eqrt(*serve, address)
+            assert (done.returncode, done.stderr.count("\n")) == (status, 1)
+            assert f"--metrics {address}: cannot listen there" in done.stderr
 
 
 @pytest.fixture
