@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 import can
+import pytest
 
 from drives import DRIVES, TILE, first_seconds
 from eqrt.runtime.bus.buses import LOCAL, open_bus
@@ -119,6 +120,40 @@ def test_what_would_keep_the_service_from_starting_fails(tmp_path: Path) -> None
     assert "SHA-256" in found["model"].found
     assert "there is no CAN interface 'usbcan'" in found["channel y"].found
     assert "--metrics-anywhere" in found["metrics"].found
+
+
+def test_where_the_service_could_not_write_or_send_fails(tmp_path: Path) -> None:
+    """Everything that `eqrt serve` would open, though nobody listens there."""
+    channel = f"doctor-{time.monotonic_ns()}"
+    found = examined(
+        "--can", channel, "--can-interface", LOCAL, "--profile", "ars408",
+        "--out-id", "0x7ff", "--record", "/proc/nothing", "--datagrams", "nohost.invalid:1",
+        "--metrics", "192.0.2.7:9464", "--metrics-anywhere",
+        "--realtime-cpus", "1000", "--realtime-strict", status=1,
+    )  # fmt: skip
+    assert {name for name, one in found.items() if one.verdict is Verdict.FAIL} == {
+        "output", "recording", "datagrams", "metrics", "cores",
+    }  # fmt: skip
+    found = examined("--can", "vcan0", "--out-can", "nowhere0", "--profile", "ars408", status=1)
+    assert found["channel nowhere0"].verdict is Verdict.FAIL
+    found = examined("--can", channel, "--can-interface", LOCAL, "--out-can", "none", status=1)
+    assert "the predictions would go nowhere" in found["output"].found
+    folder = tmp_path / "not" / "yet"
+    options = ["--can", channel, "--can-interface", LOCAL, "--record", str(folder)]
+    found = examined(*options, "--datagrams", "127.0.0.1:9", "--out-id", "0x100")
+    for check in ("output", "recording", "datagrams"):
+        assert found[check].verdict is Verdict.OK
+    assert not folder.parent.exists(), "looking leaves nothing behind"
+
+
+@pytest.mark.parametrize(("seconds", "status"), [("0", 0), ("-1", 2), ("nan", 2), ("inf", 2)])
+def test_it_listens_for_no_less_than_no_time(seconds: str, status: int) -> None:
+    channel = f"doctor-{time.monotonic_ns()}"
+    done = eqrt("doctor", "--can", channel, "--can-interface", LOCAL, "--listen", seconds)
+    assert done.returncode == status
+    assert done.stderr.count("\n") == (1 if status else 0)
+    assert "Traceback" not in done.stderr
+    assert f"traffic {channel}" not in done.stdout
 
 
 def test_a_port_in_use_may_be_the_service_itself() -> None:

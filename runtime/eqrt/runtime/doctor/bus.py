@@ -52,9 +52,15 @@ class Traffic:
 
 
 def check_channel(
-    channel: str, interface: str | None, fd: bool | None, profile: Profile | None, seconds: float
+    channel: str,
+    interface: str | None,
+    fd: bool | None,
+    profile: Profile | None,
+    seconds: float,
+    *,
+    sends: bool,
 ) -> Iterator[Finding]:
-    """Open it, and listen for so long."""
+    """Open it, and listen for so long, 0 = not at all; `sends`: predictions go there."""
     name = f"channel {channel}"
     try:
         with open_bus(channel, interface, fd=fd) as bus:
@@ -64,8 +70,10 @@ def check_channel(
     except (EqrtError, can.CanError, OSError) as error:
         yield fail(name, str(error))
         return
-    if interface in (None, "socketcan") and (room := room_of(channel)) is not None:
+    if sends and interface in (None, "socketcan") and (room := room_of(channel)) is not None:
         yield judge_room(f"room {channel}", channel, room)
+    if not seconds:
+        return
     yield judge_load(f"traffic {channel}", traffic, link.get("bitrate"))
     if profile is not None:
         yield _known(f"ids {channel}", traffic, profile)
