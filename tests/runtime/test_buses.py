@@ -22,6 +22,7 @@ from eqrt.runtime.bus.buses import (
     open_bus,
 )
 from eqrt.runtime.bus.local_bus import LocalBus
+from processes import eqrt
 from source_tree import ROOT
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="SocketCAN is Linux's")
@@ -212,3 +213,21 @@ def test_the_kernel_is_asked_what_an_interface_is() -> None:
     assert loopback.mtu_bytes >= 1500
     assert network_interface("nosuchcan") is None
     assert network_interface("n" * 40) is None
+
+
+@LINUX
+def test_channels_are_found_with_the_sockets_that_the_unit_leaves_a_service() -> None:
+    """Netlink, which if_nameindex(3) asks, is not among them."""
+    code = (
+        "import restricted, socket\n"
+        "from eqrt.runtime.bus.buses import can_channels\n"
+        "before = can_channels()\n"
+        "restricted.restrict()\n"
+        "assert can_channels() == before\n"
+        "try:\n"
+        "    socket.if_nameindex()\n"
+        "except OSError:\n"
+        "    print('restricted')\n"
+    )
+    done = eqrt(command=[sys.executable, "-c", code], cwd=ROOT / "tests")
+    assert (done.stdout, done.stderr) == ("restricted\n", "")

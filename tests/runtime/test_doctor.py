@@ -12,11 +12,19 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 import can
+import pytest
 
 from drives import DRIVES, TILE, first_seconds
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
-from eqrt.runtime.doctor.bus import Traffic, judge_link, judge_load, parse_link
+from eqrt.runtime.doctor.bus import (
+    Traffic,
+    judge_link,
+    judge_load,
+    judge_room,
+    parse_link,
+    room_of,
+)
 from eqrt.runtime.doctor.finding import Finding, Verdict
 from eqrt.runtime.operation.endpoint import Endpoint
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
@@ -114,6 +122,40 @@ def test_what_would_keep_the_service_from_starting_fails(tmp_path: Path) -> None
     assert "--metrics-anywhere" in found["metrics"].found
 
 
+def test_where_the_service_could_not_write_or_send_fails(tmp_path: Path) -> None:
+    """Everything that `eqrt serve` would open, though nobody listens there."""
+    channel = f"doctor-{time.monotonic_ns()}"
+    found = examined(
+        "--can", channel, "--can-interface", LOCAL, "--profile", "ars408",
+        "--out-id", "0x7ff", "--record", "/proc/nothing", "--datagrams", "nohost.invalid:1",
+        "--metrics", "192.0.2.7:9464", "--metrics-anywhere",
+        "--realtime-cpus", "1000", "--realtime-strict", status=1,
+    )  # fmt: skip
+    assert {name for name, one in found.items() if one.verdict is Verdict.FAIL} == {
+        "output", "recording", "datagrams", "metrics", "cores",
+    }  # fmt: skip
+    found = examined("--can", "vcan0", "--out-can", "nowhere0", "--profile", "ars408", status=1)
+    assert found["channel nowhere0"].verdict is Verdict.FAIL
+    found = examined("--can", channel, "--can-interface", LOCAL, "--out-can", "none", status=1)
+    assert "the predictions would go nowhere" in found["output"].found
+    folder = tmp_path / "not" / "yet"
+    options = ["--can", channel, "--can-interface", LOCAL, "--record", str(folder)]
+    found = examined(*options, "--datagrams", "127.0.0.1:9", "--out-id", "0x100")
+    for check in ("output", "recording", "datagrams"):
+        assert found[check].verdict is Verdict.OK
+    assert not folder.parent.exists(), "looking leaves nothing behind"
+
+
+@pytest.mark.parametrize(("seconds", "status"), [("0", 0), ("-1", 2), ("nan", 2), ("inf", 2)])
+def test_it_listens_for_no_less_than_no_time(seconds: str, status: int) -> None:
+    channel = f"doctor-{time.monotonic_ns()}"
+    done = eqrt("doctor", "--can", channel, "--can-interface", LOCAL, "--listen", seconds)
+    assert done.returncode == status
+    assert done.stderr.count("\n") == (1 if status else 0)
+    assert "Traceback" not in done.stderr
+    assert f"traffic {channel}" not in done.stdout
+
+
 def test_a_port_in_use_may_be_the_service_itself() -> None:
     with Endpoint("127.0.0.1:0") as endpoint:
         assert examined("--metrics", endpoint.address)["metrics"].verdict is Verdict.WARN
@@ -166,6 +208,16 @@ def test_a_bus_that_is_nearly_full_is_a_warning() -> None:
 
     assert (full(2000).verdict, full(4000).verdict) == (Verdict.OK, Verdict.WARN)
     assert "89% of the bitrate" in full(4000).found
+
+
+def test_an_interface_that_takes_less_than_a_cycle_is_a_warning() -> None:
+    """10 messages unless told otherwise; a virtual one may have no queue at all."""
+    found = judge_room("room can0", "can0", 10)
+    assert found.verdict is Verdict.WARN
+    assert found.advice == "sudo ip link set can0 txqueuelen 1000"
+    assert [judge_room("room can0", "can0", room).verdict for room in (0, 1000)] == [Verdict.OK] * 2
+    assert isinstance(room_of("lo"), int)
+    assert room_of("nowhere0") is None
 
 
 def test_error_frames_are_a_warning() -> None:

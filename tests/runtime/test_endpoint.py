@@ -17,9 +17,11 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from drives import Car, cycle, shipped_predictor
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import AddressError, UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.bus.links import opener
+from eqrt.runtime.bus.receiver import Receiver
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.operation.endpoint import (
     MAX_CLIENTS,
@@ -33,10 +35,10 @@ from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.status_book import StatusBook
-from no_channels import NoChannels
-from processes import PATIENCE_S, Serving
+from processes import PATIENCE_S, Serving, eqrt
 from source_tree import ROOT
 
+STATES = ("UP", "ERROR_PASSIVE", "BUS_OFF", "DOWN")
 SAMPLE = re.compile(r'^(\w+)(?:\{((?:\w+="(?:[^"\\\n]|\\[\\"n])*",?)+)\})? (\S+)$')
 
 
@@ -44,7 +46,9 @@ SAMPLE = re.compile(r'^(\w+)(?:\{((?:\w+="(?:[^"\\\n]|\\[\\"n])*",?)+)\})? (\S+)
 def status() -> ServiceStatus:
     """Of a service that has just begun, with everything that a status can have."""
     pipeline = Pipeline(load_profile("ars408"), shipped_predictor())
-    made = StatusBook(pipeline, NoChannels(), []).close(time.monotonic() + 1.0)
+    channel = f"status-{time.monotonic_ns()}"
+    with Receiver(opener(LOCAL, fd=None), {channel: None}, lambda _: None) as receiver:
+        made = StatusBook(pipeline, receiver, []).close(time.monotonic() + 1.0)
     return msgspec.structs.replace(
         made,
         mode=int(Mode.RUN),
@@ -126,6 +130,30 @@ def test_prometheus_own_reader_reads_them(status: ServiceStatus) -> None:
     assert read["eqrt_latency_seconds_bucket", (("le", "+Inf"),)] == 4
 
 
+def test_every_metric_is_one_family_with_one_type(status: ServiceStatus) -> None:
+    """As the format demands; the counts of channels are said by channel and not once more."""
+    text = render(status, Latencies())
+    families = [family.name for family in text_string_to_metric_families(text)]
+    assert len(families) == len(set(families))
+    assert {"bus_not_up", "bus_losses", "bus_error_frames"} <= set(status.totals)
+    losses = [line for line in text.splitlines() if line.startswith("eqrt_bus_losses_total")]
+    assert losses == ['eqrt_bus_losses_total{channel="can0"} 2.0']
+    assert "bus_not_up" not in text
+
+
+@pytest.mark.parametrize(
+    ("state", "is_up"), [("UP", 1), ("ERROR_PASSIVE", 1), ("BUS_OFF", 0), ("DOWN", 0)]
+)
+def test_a_channel_that_carries_messages_is_up(
+    state: str, is_up: int, status: ServiceStatus
+) -> None:
+    bus = BusStatus(channel="can0", state=state, since_s=1.0)
+    found = samples(render(msgspec.structs.replace(status, buses=[bus]), Latencies()))
+    assert found["eqrt_bus_up", 'channel="can0"'] == is_up
+    states = {one: found["eqrt_bus_state", f'channel="can0",state="{one}"'] for one in STATES}
+    assert states == {one: float(one == state) for one in STATES}
+
+
 def test_the_documentation_has_every_metric() -> None:
     text = (ROOT / "docs/operations.md").read_text(encoding="utf-8")
     for metric in METRICS:
@@ -162,8 +190,19 @@ def test_another_place_can_be_allowed() -> None:
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
-    with Endpoint("127.0.0.1:0") as first, pytest.raises(UsageError, match="cannot listen there"):
+    with Endpoint("127.0.0.1:0") as first, pytest.raises(AddressError, match="cannot listen there"):
         Endpoint(first.address)
+
+
+def test_what_may_change_ends_a_service_so_that_it_is_started_again() -> None:
+    """Status 1: a port that is taken, an address that is not up yet. 2 keeps the unit down."""
+    serve = ["serve", "--can", f"port-{time.monotonic_ns()}", "--can-interface", LOCAL]
+    serve += ["--profile", "ars408", "--metrics-anywhere", "--metrics"]
+    with Endpoint("127.0.0.1:0") as taken:
+        for address, status in ((taken.address, 1), ("192.0.2.7:9464", 1), ("nowhere", 2)):
+            done = eqrt(*serve, address)
+            assert (done.returncode, done.stderr.count("\n")) == (status, 1)
+            assert f"--metrics {address}: cannot listen there" in done.stderr
 
 
 @pytest.fixture

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
+import time
 from collections.abc import Iterator
 from dataclasses import replace
+from operator import eq
 from typing import Any
 
 import can
@@ -18,10 +21,11 @@ from numpy.typing import NDArray
 from eqrt.core.errors import UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.bus.buses import open_bus
+from eqrt.runtime.bus.outbox import AGAIN_S, Outbox
 from eqrt.runtime.output import can_output
 from eqrt.runtime.output.can_output import Offset, encode_classic, encode_fd, protect
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
-from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher
+from eqrt.runtime.output.publish_can import BASE_ID, CanPublisher, nearest_first
 from eqrt.runtime.protection.e2e import (
     Checker,
     Profile2,
@@ -59,7 +63,7 @@ class Wire:
         self.database = database
         self.listener = open_bus(channel, "virtual", fd=fd)
         self.bus = open_bus(channel, "virtual", fd=fd)
-        self.publisher = CanPublisher(self.bus, **options)
+        self.publisher = CanPublisher(Outbox(self.bus), **options)
 
     def messages(self, forecasts: ForecastSet) -> list[can.Message]:
         """What is on the bus once `forecasts` are published."""
@@ -164,7 +168,7 @@ def test_a_car_ahead_reads_as_such_on_classic_can(classic: Wire) -> None:
 
 
 def test_every_object_is_decoded_to_within_half_a_step(fd: Wire) -> None:
-    forecasts = many(32)
+    forecasts = nearest_first(many(32))
     ego_from_map = forecasts.map_from_ego.inverse()
     expected = ego_from_map.apply(forecasts.trajectories[:, 0, 2::3])
     _, *decoded = fd.decoded(forecasts)
@@ -324,15 +328,106 @@ def test_ids_that_do_not_fit_are_refused(base_id: int) -> None:
         open_bus(next(CHANNELS), "virtual") as bus,
         pytest.raises(UsageError, match="first CAN id"),
     ):
-        CanPublisher(bus, base_id=base_id)
+        CanPublisher(Outbox(bus), base_id=base_id)
 
 
 def test_a_bus_that_takes_nothing_is_counted_and_not_raised(database: Database) -> None:
     wire = Wire(database)
+    """It is given up when the next cycle comes."""
     wire.publisher.publish(one_car())
     wire.close()
     wire.publisher.publish(one_car())
+    assert (wire.publisher.sent, wire.publisher.failed) == (2, 0)
+    wire.publisher.publish(one_car())
     assert (wire.publisher.sent, wire.publisher.failed) == (2, 2)
+
+
+@pytest.mark.parametrize("is_fd", [True, False])
+def test_the_nearest_object_goes_first_with_all_that_is_said_of_it(
+    is_fd: bool, database: Database
+) -> None:
+    """Cycle, then object by object: ObjectIndex 0 is the nearest."""
+    wire = Wire(database, fd=is_fd, num_modes=2)
+    forecasts = many(20)
+    decoded = wire.decoded(forecasts)
+    wire.close()
+    of_the_cycle, each = (1, 2) if is_fd else (2, 4)
+    indices = [values.get("ObjectIndex", -1) for _, values in decoded]
+    assert indices == [-1] * of_the_cycle + [i for i in range(20) for _ in range(each)]
+    if is_fd:
+        far_m = [np.hypot(car["PositionX"], car["PositionY"]) for _, car in decoded[1:]]
+        assert far_m == sorted(far_m)
+    else:
+        kinds = [name for name, _ in decoded[2:]]
+        assert kinds == ["EQRT_ObjectClassic", *["EQRT_PointClassic"] * 3] * 20
+    (nearest,) = {
+        int(v["TrackId"]) for _, v in decoded if v.get("ObjectIndex") == 0 if "TrackId" in v
+    }
+    ego = forecasts.map_from_ego
+    away_m = np.linalg.norm(forecasts.position - (ego.x_m, ego.y_m), axis=1)
+    assert nearest == forecasts.track_id[np.argmin(away_m)]
+
+
+class NarrowBus:
+    """Has room for some messages, as a network interface has; who reads makes room again."""
+
+    def __init__(self, room: int, *, fd: bool) -> None:
+        self.protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        self.room = room
+        self.taken: list[can.Message] = []
+
+    def send(self, msg: can.Message) -> None:
+        if len(self.taken) >= self.room:
+            raise OSError(errno.ENOBUFS, "No buffer space available")
+        self.taken.append(msg)
+
+    def read(self) -> list[can.Message]:
+        read, self.taken = self.taken, []
+        return read
+
+
+@pytest.mark.parametrize("is_fd", [True, False])
+def test_what_a_full_bus_refuses_is_sent_when_there_is_room(is_fd: bool) -> None:
+    """In order, none twice, by whoever asks now and then; never before it is time."""
+    bus, wide = NarrowBus(10, fd=is_fd), NarrowBus(1000, fd=is_fd)
+    outbox = Outbox(bus)
+    CanPublisher(Outbox(wide)).publish(many(32))
+    CanPublisher(outbox).publish(many(32))
+    heard = bus.read()
+    assert len(heard) == 10
+    begun_s = now_s = time.monotonic()
+    while (left_s := outbox.push(now_s)) < np.inf:
+        assert 0.0 < left_s <= AGAIN_S
+        heard += bus.read()
+        now_s += left_s
+    heard += bus.read()
+    assert now_s - begun_s == pytest.approx(AGAIN_S * (len(heard) // 10), rel=0.5)
+    assert [bytes(one.data) for one in heard] == [bytes(one.data) for one in wide.read()]
+    assert (outbox.sent, outbox.failed) == (len(heard), 0)
+
+
+@pytest.mark.parametrize("is_fd", [True, False])
+def test_a_bus_too_slow_for_all_loses_the_farthest_objects_only(is_fd: bool) -> None:
+    """And a receiver that checks every counter accepts all that comes, cycle after cycle."""
+    bus = NarrowBus(21, fd=is_fd)
+    publisher = CanPublisher(Outbox(bus))
+    checkers: dict[int, Checker] = {}
+    for cycle in range(40):
+        publisher.publish(replace(many(32), cycle=cycle))
+        messages = bus.read()
+        if is_fd:
+            assert [one.data[4] for one in messages[1:]] == list(range(20))
+        else:
+            assert [one.data[2] for one in messages[2:]] == [i // 4 for i in range(19)]
+        for message in messages:
+            one = message.arbitration_id
+            protection: Protection = (
+                Profile5(data_id=data_id_of(one)) if is_fd else Profile2(data_ids=data_ids_of(one))
+            )
+            checker = checkers.setdefault(one, Checker(protection, max_delta=1))
+            assert checker.check(message.data) is Status.OK
+    per_cycle = 33 if is_fd else 130
+    assert (publisher.sent, publisher.failed) == (40 * 21, 39 * (per_cycle - 21))
 
 
 def test_more_objects_than_can_be_counted_are_left_out(fd: Wire) -> None:
@@ -405,3 +500,19 @@ def test_the_checks_of_32_objects_are_computed_within_the_budget(
     benchmark.pedantic(protect_all, rounds=500, warmup_rounds=20)
     if benchmark.enabled:
         assert np.quantile(benchmark.stats.stats.data, 0.99) < PROTECTION_BUDGET_S
+
+
+def test_the_bases_whose_data_ids_clash_are_those_that_the_documentation_names() -> None:
+    """Of two services on one bus; ids that are the same are another matter."""
+
+    def clash(base: int, other: int) -> tuple[bool, bool]:
+        """On classic CAN, on CAN FD."""
+        fd, classic = [Offset.STATUS, Offset.TRAJECTORY], [o for o in Offset if o >= 2]
+        twos = [[data_ids_of(one + offset) for offset in classic] for one in (base, other)]
+        fives = [{data_id_of(one + offset) for offset in fd} for one in (base, other)]
+        pairs = itertools.product(*twos)
+        return any(any(map(eq, *pair)) for pair in pairs), bool(fives[0] & fives[1])
+
+    for apart in (*range(6, 0x300), *range(0xFFF0, 0x10010)):
+        expected = (min(apart % 0x100, -apart % 0x100) <= 3, min(apart, abs(apart - 0x10000)) <= 1)
+        assert clash(BASE_ID, BASE_ID + apart) == expected, hex(apart)

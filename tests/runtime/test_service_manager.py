@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +20,7 @@ from eqrt.core.frames import Pose2
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.operation.service_manager import ServiceManager
 from processes import PATIENCE_S, Heard, Serving
+from source_tree import ROOT
 
 
 class Manager:
@@ -39,6 +43,13 @@ class Manager:
             self.said.append(self._socket.recv(4096).decode())
         except TimeoutError:
             return
+
+    def hear_what_waits(self) -> None:
+        self._socket.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self.said.append(self._socket.recv(4096).decode())
+        self._socket.settimeout(0.05)
 
     def count(self, line: str) -> int:
         return self.said.count(line)
@@ -78,6 +89,24 @@ def test_the_manager_hears_of_start_reload_and_end_and_the_watchdog_on_a_silent_
         heard.hear(lambda: "STOPPING=1" in heard.said)
     assert (status, stderr) == (0, "")
     assert "STOPPING=1" in heard.said[-2:]
+
+
+def test_the_units_reload_ends_after_the_service_has_told_that_it_begins(
+    manager: tuple[str, Manager],
+) -> None:
+    """Else systemd takes the reload for done: it looks when the last command has ended."""
+    address, heard = manager
+    unit = (ROOT / "deploy/eqrt.service").read_text(encoding="utf-8")
+    commands = re.findall(r"^ExecReload=(.+)$", unit, re.MULTILINE)
+    channel = f"manager-{time.monotonic_ns()}"
+    with Serving(*options(channel), NOTIFY_SOCKET=address) as service:
+        heard.hear(lambda: heard.count("READY=1") == 1)
+        for times in range(1, 7):
+            for command in commands:
+                subprocess.run(command.replace("$MAINPID", str(service.pid)).split(), check=True)
+            heard.hear_what_waits()
+            assert sum(line.startswith("RELOADING=1\n") for line in heard.said) == times
+            heard.hear(lambda: heard.count("READY=1") == times + 1)  # noqa: B023 (called at once)
 
 
 def test_a_watchdog_of_another_process_is_not_fed(manager: tuple[str, Manager]) -> None:

@@ -139,6 +139,8 @@ def test_the_name_of_a_profile_is_not_taken_for_a_file(tmp_path: Path) -> None:
         ("[serve]\ncan = [\n'c', 1]\n", r"line 2: can is \[.*\], expected a list of strings"),
         ("[serve]\nquiet = 1\n", r"line 2: quiet is 1, expected true or false"),
         ("[serve]\nout_modes = true\n", r"line 2: out_modes is true, expected an integer"),
+        ("[serve]\nout_modes = 0\n", r"line 2: out_modes: '0' is not a number of modes; give 1"),
+        ("[serve]\nout_modes = -1\n", r"line 2: out_modes: '-1' is not a number of modes"),
         ("[serve]\nout_modes = '1'\n", r"line 2: out_modes is \"1\", expected an integer"),
         ("[serve]\nout_id = 'z'\n", r"line 2: out_id: 'z' is not a CAN id"),
         ("[serve]\ntile = 3\n", r"line 2: tile is 3, expected a string"),
@@ -230,4 +232,14 @@ def test_serve_prints_its_configuration_and_ends(tmp_path: Path) -> None:
     done = eqrt("serve", "--config", str(written(tmp_path, "[serve]\ncann = 1\n")))
     assert done.returncode == 2
     assert "line 2: unknown key 'cann' in [serve]; did you mean 'can'?" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "1.5", "many"])
+def test_a_number_of_modes_that_is_none_is_refused(count: str) -> None:
+    """In one line, before anything is opened."""
+    done = eqrt("serve", "--can", "can0", "--profile", "ars408", "--out-modes", count)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("eqrt: argument --out-modes: ")
+    assert "is not a number of modes; give 1 or more" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -30,6 +30,7 @@ from eqrt.runtime.bench.service.crowd import PROFILE, crowded_cycles
 from eqrt.runtime.bench.service.orders import BusOrder, TrafficOrder
 from eqrt.runtime.bench.service.programs import Program
 from eqrt.runtime.bus.buses import LOCAL
+from eqrt.runtime.bus.outbox import Outbox
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.datagrams import Datagram, decode_datagram, encode_datagrams
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
@@ -142,7 +143,7 @@ def simulated(seconds: float, objects: int) -> Soak:
     soak = Soak("simulated", seconds)
     pipeline = Pipeline(load_profile(PROFILE), shipped_predictor(), load_tile(TILE))
     promises = Promises(pipeline.predictor.contract.dt_s)
-    publisher = CanPublisher(Nowhere())
+    publisher = CanPublisher(Outbox(Nowhere()))
     drive = list(crowded_cycles(objects))
     blocks = []
     for number in range(round(seconds / PERIOD_S)):

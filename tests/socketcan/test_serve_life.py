@@ -11,7 +11,10 @@ from socketcan.vcan import program
 
 
 def test_a_service_outlives_its_channel_and_says_so(run_on_vcan: RunOnVcan, tmp_path: Path) -> None:
-    """It comes late, goes down, comes back, and is unplugged: a line each, and none in between."""
+    """It comes late, goes down, comes back, and is unplugged: a line each, and none in between.
+
+    With no sockets but those that deploy/eqrt.service leaves it.
+    """
     (tmp_path / "part.log").write_text(first_seconds(DRIVES["ars408"].log, 2.0))
     done = run_on_vcan(program("serve_life.py", "part.log"), 120.0)
     assert done.status == 0, done.stderr
@@ -23,6 +26,7 @@ def test_a_service_outlives_its_channel_and_says_so(run_on_vcan: RunOnVcan, tmp_
     assert found["ended_s"] < 5.0
     said = [line.removeprefix("eqrt serve: vcan5 is ") for line in found["errors"].splitlines()]
     assert said[0].startswith("eqrt serve: waiting for vcan5: there is no CAN channel 'vcan5'")
+    assert "(found: vcan0, vcan1, vcan2)" in said[0]
     assert [line.partition(" after ")[0] for line in said[1:4]] == [
         "there",
         "lost: network is down",

@@ -19,7 +19,10 @@ from socketcan.machine import SETUP, Completed, environment
 
 KERNEL = "linux.uml"
 MODULES = Path("/usr/lib/uml/modules")
-DRIVERS = ("net/can/can", "net/can/can-raw", "drivers/net/can/dev/can-dev", "drivers/net/can/vcan")
+DRIVERS = (
+    *("net/can/can", "net/can/can-raw", "drivers/net/can/dev/can-dev", "drivers/net/can/vcan"),
+    "net/sched/sch_netem",  # makes a bus as slow as real ones
+)
 MEMORY_MB = 768
 BOOT_TIMEOUT_S = 60.0  # a boot takes 1.7 s; a machine that is busy with other tests takes longer
 

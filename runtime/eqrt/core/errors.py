@@ -40,6 +40,10 @@ class AbsentBusError(BusError):
     """A CAN channel is not there, or down; it may still come."""
 
 
+class AddressError(EqrtError):
+    """A network address cannot be used now: taken, not up yet, or not to be found."""
+
+
 class LogError(EqrtError):
     """A recorded log cannot be read."""
 

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
-from eqrt.core.errors import UsageError
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.health import in_sum, trouble
 from eqrt.runtime.bus.ids import Ids
@@ -35,7 +34,7 @@ from eqrt.runtime.recording.options import start_recorder
 from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.runs import RunTape, TapedRunner
 from eqrt.runtime.recording.steps import TapedClock
-from eqrt.runtime.serve_options import NO_CHANNEL, add_arguments
+from eqrt.runtime.serve_options import add_arguments, check_outputs, out_channel
 from eqrt.runtime.service import Chore, Observer, Publisher, Service
 from eqrt.runtime.settings import as_toml, namespace
 from eqrt.runtime.signals import asked_to_reload, until_told_to_stop
@@ -76,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace) -> int:
+    check_outputs(args)
     log = EventLog(args.log_format, LEVELS[args.log_level])
     profile = load_profile(args.profile)
     channels = parse_channels(args.can, profile.roles)
@@ -198,30 +198,19 @@ def _receiver(
 ) -> Receiver:
     """Reads `channels`, and opens the one that predictions go to, if it is another, for sending."""
     wanted: dict[str, Ids | None] = dict.fromkeys(channels, profile.ids)
-    if (out := _out_channel(args)) is not None:
+    if (out := out_channel(args)) is not None:
         wanted.setdefault(out, ())
     say = BusTeller(log, sys.stderr)
     return Receiver(opener(args.can_interface, fd=args.fd), wanted, say, wait=args.wait_for_bus)
-
-
-def _out_channel(args: argparse.Namespace) -> str | None:
-    """Where predictions go on CAN; None = nowhere."""
-    if args.out_can == NO_CHANNEL:
-        return None
-    return str(args.out_can or args.can[0].rpartition("=")[2])
 
 
 def _publishers(
     args: argparse.Namespace, receiver: Receiver, stack: contextlib.ExitStack
 ) -> list[Publisher]:
     publishers: list[Publisher] = []
-    if (out := _out_channel(args)) is not None:
-        bus = receiver.connection(out)
-        publishers.append(CanPublisher(bus, base_id=args.out_id, num_modes=args.out_modes))
-    elif not args.datagrams and not args.record:
-        raise UsageError(
-            "--out-can none, no --datagrams, no --record: the predictions would go nowhere"
-        )
+    if (out := out_channel(args)) is not None:
+        outbox = receiver.connection(out).outbox
+        publishers.append(CanPublisher(outbox, base_id=args.out_id, num_modes=args.out_modes))
     if args.datagrams:
         publishers.append(stack.enter_context(DatagramPublisher(args.datagrams)))
     return publishers

@@ -7,13 +7,14 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from eqrt.core.errors import UsageError
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.decoding.profile import builtin_profiles
 from eqrt.runtime.operation.endpoint import DEFAULT_ADDRESS as METRICS_ADDRESS
 from eqrt.runtime.operation.event_log import FORMATS, LEVELS
 from eqrt.runtime.operation.realtime import parse_cpus, parse_priority
 from eqrt.runtime.output.datagrams import DEFAULT_ADDRESS
-from eqrt.runtime.output.publish_can import BASE_ID
+from eqrt.runtime.output.publish_can import BASE_ID, check_base_id
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.runtime.recording.options import add_record_arguments
 from eqrt.runtime.settings import FileOrName, Settings, Switch
@@ -78,8 +79,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out-modes",
-        type=int,
-        default=1,
+        type=ModeCount,
+        default=ModeCount(1),
         metavar="N",
         help="modes of each object sent on CAN FD, most probable first (default 1)",
     )
@@ -177,6 +178,38 @@ def add_pipeline_arguments(parser: argparse.ArgumentParser, *, of_recordings: bo
         action=Switch,
         help="the sensor stands still: predict although no message tells its motion",
     )
+
+
+def out_channel(args: argparse.Namespace) -> str | None:
+    """Where predictions go on CAN; None = nowhere."""
+    if args.out_can == NO_CHANNEL or not (args.out_can or args.can):
+        return None
+    return str(args.out_can or args.can[0].rpartition("=")[2])
+
+
+def check_outputs(args: argparse.Namespace) -> None:
+    """UsageError if the predictions would go nowhere, or by CAN ids that there are not."""
+    if args.out_can != NO_CHANNEL:
+        check_base_id(args.out_id)
+    elif not args.datagrams and not args.record:
+        raise UsageError(
+            "--out-can none, no --datagrams, no --record: the predictions would go nowhere"
+        )
+
+
+class ModeCount(int):
+    """How many modes of each object are sent."""
+
+    __slots__ = ()
+
+    def __new__(cls, text: str | int) -> ModeCount:
+        """argparse.ArgumentTypeError if that is not a number, or none at all."""
+        try:
+            if (count := int(text)) >= 1:
+                return super().__new__(cls, count)
+        except ValueError:
+            pass
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of modes; give 1 or more")
 
 
 class ArbitrationId(int):

@@ -78,7 +78,7 @@ class Option:
             return 'a list of strings, as in ["..."]'
         if self.action.choices:
             return " or ".join(f'"{choice}"' for choice in self.action.choices)
-        if self.action.type is int:
+        if _is_integer(self.action.type):
             return "an integer"
         if self.action.type is float:
             return "a number"
@@ -286,9 +286,13 @@ def _is_scalar(value: object, kind: object) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if kind in _TEXTS:
         return isinstance(value, str)
-    if kind is int:
+    if _is_integer(kind):
         return type(value) is int
     return isinstance(value, str) or type(value) is int
+
+
+def _is_integer(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, int)
 
 
 def _shown(value: object) -> str:

@@ -14,9 +14,12 @@ from pathlib import Path
 
 import can
 
+import restricted
+
 EQRT = [sys.executable, "-m", "eqrt"]
+RESTRICTED = [sys.executable, restricted.__file__, *EQRT]  # with the sockets of the unit
 CHANNEL = "vcan5"
-SERVE = [*EQRT, "serve", "--can", CHANNEL, "--profile", "ars408", "--wait-for-bus"]
+SERVE = [*RESTRICTED, "serve", "--can", CHANNEL, "--profile", "ars408", "--wait-for-bus"]
 STATUS, MODE_BYTE, NUM_OBJECTS_BYTE, SILENT = 0x6E0, 3, 5, 6  # of eqrt.dbc
 PATIENCE_S = 30.0
 

@@ -13,6 +13,7 @@ import struct
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import can
@@ -151,6 +152,19 @@ def network_interface(name: str) -> NetworkInterface | None:
     return NetworkInterface(hardware == _CAN_HARDWARE, bool(flags & _UP), mtu)
 
 
+def can_channels() -> list[str]:
+    """The CAN channels of this machine. Linux only.
+
+    Not by if_nameindex(3), which asks the kernel by netlink: deploy/eqrt.service admits none.
+    """
+    try:
+        lines = Path("/proc/net/dev").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return []
+    names = [line.partition(":")[0].strip() for line in lines if ":" in line]
+    return [name for name in names if (found := network_interface(name)) and found.is_can]
+
+
 def check_socketcan(channel: str, fd: bool | None) -> bool:
     """Whether to open the channel for CAN FD; BusError if it cannot be used.
 
@@ -193,6 +207,5 @@ def _check_kernel(channel: str) -> None:
 
 
 def _channels_found() -> str:
-    names = [name for _, name in socket.if_nameindex()]
-    channels = [name for name in names if (found := network_interface(name)) and found.is_can]
+    channels = can_channels()
     return f"found: {', '.join(channels)}" if channels else "this machine has none"

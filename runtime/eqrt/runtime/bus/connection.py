@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import selectors
 import threading
@@ -14,6 +15,7 @@ import can
 from eqrt.core.errors import AbsentBusError, in_one_line
 from eqrt.runtime.bus.health import LOST, BusHealth, BusState, BusWord, told_overrun, told_state
 from eqrt.runtime.bus.links import Link
+from eqrt.runtime.bus.outbox import Outbox
 
 FIRST_RETRY_S = 0.1
 LONGEST_RETRY_S = 1.0
@@ -39,6 +41,8 @@ class Connection:
     ) -> None:
         """Registers with the selector while open, as data of its key. Call `open` next."""
         self.channel = channel
+        self.outbox = Outbox(self)
+        """Sends what is put there, by and by, while somebody waits for messages."""
         self._open_link = open_link
         self._selector = selector
         self._say = say
@@ -76,7 +80,9 @@ class Connection:
         self._enter(BusState.UP)
 
     def try_again(self, now_s: float) -> float:
-        """Go on with opening a lost channel, without waiting; seconds until this wants a call."""
+        """Go on with opening, or with sending, without waiting; seconds until this wants a call."""
+        if self._link is not None:
+            return self.outbox.push(now_s)
         if self._attempt is None:
             if not now_s >= self._due_s:
                 return self._due_s - now_s
@@ -144,7 +150,7 @@ class Connection:
     def send(self, msg: can.Message) -> None:
         """Hand a message to the driver; OSError or can.CanError if it fails, or there is none."""
         if self._link is None:
-            raise can.CanOperationError(f"{self.channel} is down")
+            raise can.CanOperationError(f"{self.channel} is down", errno.ENETDOWN)
         self._link.send(msg)
 
     @property

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import can
@@ -22,6 +23,8 @@ _STANDARD_BITS, _EXTENDED_BITS = 47, 67  # of a classic message without data, ga
 _BUSY = 0.7  # share of the bitrate; above, messages of low priority come late
 _SHOWN_IDS = 6
 _PATIENCE_S = 5.0
+_INTERFACES = Path("/sys/class/net")
+_WHOLE_CYCLE = 130  # messages: 32 objects on classic CAN
 
 
 @dataclass(slots=True)
@@ -49,9 +52,15 @@ class Traffic:
 
 
 def check_channel(
-    channel: str, interface: str | None, fd: bool | None, profile: Profile | None, seconds: float
+    channel: str,
+    interface: str | None,
+    fd: bool | None,
+    profile: Profile | None,
+    seconds: float,
+    *,
+    sends: bool,
 ) -> Iterator[Finding]:
-    """Open it, and listen for so long."""
+    """Open it, and listen for so long, 0 = not at all; `sends`: predictions go there."""
     name = f"channel {channel}"
     try:
         with open_bus(channel, interface, fd=fd) as bus:
@@ -60,6 +69,10 @@ def check_channel(
             traffic = heard(bus, seconds)
     except (EqrtError, can.CanError, OSError) as error:
         yield fail(name, str(error))
+        return
+    if sends and interface in (None, "socketcan") and (room := room_of(channel)) is not None:
+        yield judge_room(f"room {channel}", channel, room)
+    if not seconds:
         return
     yield judge_load(f"traffic {channel}", traffic, link.get("bitrate"))
     if profile is not None:
@@ -123,6 +136,26 @@ def judge_link(name: str, link: dict[str, Any], is_fd: bool) -> Finding:
         f"{found}, {state}",
         "wrong bitrate, no second node that answers, or a bad line; then: ip link set NAME type "
         "can restart",
+    )
+
+
+def room_of(channel: str) -> int | None:
+    """How many messages a network interface takes at once; None if there is none of that name."""
+    try:
+        return int((_INTERFACES / channel / "tx_queue_len").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+def judge_room(name: str, channel: str, room: int) -> Finding:
+    """Whether the interface takes all predictions of a cycle at once; 0 = it has no queue."""
+    found = f"the interface takes {room or 'all'} messages at once"
+    if not 0 < room < _WHOLE_CYCLE:
+        return ok(name, found)
+    return warn(
+        name,
+        f"{found}, a cycle may have {_WHOLE_CYCLE}: the rest waits in the service",
+        f"sudo ip link set {channel} txqueuelen 1000",
     )
 
 

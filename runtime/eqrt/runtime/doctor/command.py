@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -20,8 +21,17 @@ from eqrt.runtime.decoding.profile import Profile
 from eqrt.runtime.doctor.bus import check_channel
 from eqrt.runtime.doctor.finding import Finding, Verdict, fail, has_failed, warn
 from eqrt.runtime.doctor.machine import check_machine
-from eqrt.runtime.doctor.parts import check_metrics, check_model, check_profile, check_tile
+from eqrt.runtime.doctor.parts import (
+    check_datagrams,
+    check_metrics,
+    check_model,
+    check_output,
+    check_profile,
+    check_recording,
+    check_tile,
+)
 from eqrt.runtime.operation.realtime import Realtime, parse_cpus
+from eqrt.runtime.serve_options import out_channel
 from eqrt.runtime.settings import as_toml, namespace
 
 LISTEN_S = 2.0
@@ -34,11 +44,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.add_argument(
         "--listen",
-        type=float,
+        type=_seconds,
         default=LISTEN_S,
         metavar="S",
-        help=f"how long to listen on every channel (default: {LISTEN_S:g})",
+        help=f"how long to listen on every channel, 0 = not at all (default: {LISTEN_S:g})",
     )
+
+
+def _seconds(text: str) -> float:
+    """A time to wait."""
+    try:
+        if 0.0 <= (seconds := float(text)) < math.inf:
+            return seconds
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, 0 or more")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,29 +88,40 @@ def examine(asked: argparse.Namespace, listen_s: float) -> Iterator[Finding]:
         lock_memory=asked.realtime_lock_memory,
         cpus=parse_cpus(asked.realtime_cpus) if asked.realtime_cpus else None,
     )
-    yield from check_machine(realtime, Path(os.environ.get("STATE_DIRECTORY", ".")).absolute())
+    state = Path(os.environ.get("STATE_DIRECTORY", ".")).absolute()
+    yield from check_machine(realtime, state, strict=asked.realtime_strict)
     profile, finding = check_profile(asked.profile)
     yield finding
     yield check_model(asked.model)
     yield check_tile(asked.tile)
     yield check_metrics(asked.metrics, asked.metrics_anywhere)
+    yield check_datagrams(asked.datagrams)
+    yield check_recording(asked)
+    yield check_output(asked)
     yield from _channels(asked, profile, listen_s)
 
 
 def _channels(
     asked: argparse.Namespace, profile: Profile | None, listen_s: float
 ) -> Iterator[Finding]:
-    if not asked.can:
+    heard = {option.rpartition("=")[2] for option in asked.can or ()}
+    if not heard:
         yield warn("channels", "none named", "name one with --can or in --config")
-        return
-    channels = {option.rpartition("=")[2] for option in asked.can}
-    if profile is not None:
+    elif profile is not None:
         try:
-            channels = set(parse_channels(asked.can, profile.roles).values())
+            heard = set(parse_channels(asked.can, profile.roles).values())
         except EqrtError as error:
             yield fail("channels", str(error))
-    for channel in sorted(channels):
-        yield from check_channel(channel, asked.can_interface, asked.fd, profile, listen_s)
+    out = out_channel(asked)
+    for channel in sorted(heard if out is None else heard | {out}):
+        yield from check_channel(
+            channel,
+            asked.can_interface,
+            asked.fd,
+            profile,
+            listen_s if channel in heard else 0.0,
+            sends=channel == out,
+        )
 
 
 def _say(finding: Finding) -> None:

@@ -10,10 +10,11 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from eqrt.runtime.bench.environment import parse_cpuinfo
-from eqrt.runtime.doctor.finding import Finding, ok, warn
+from eqrt.runtime.doctor.finding import Finding, Verdict, ok, warn
 from eqrt.runtime.operation.realtime import Realtime, may_be_realtime, may_lock_memory
 
 _PACKAGES = ("eqrt", "numpy", "onnxruntime", "python-can", "cantools", "msgspec")
@@ -25,13 +26,17 @@ _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronized
 _MIN_FREE_BYTES = 1 << 30
 
 
-def check_machine(realtime: Realtime, state: Path) -> Iterator[Finding]:
-    """`realtime`: what is asked for. `state`: the only folder that the service may write in."""
+def check_machine(realtime: Realtime, state: Path, *, strict: bool) -> Iterator[Finding]:
+    """`realtime`: what is asked for; `strict`: the service does not start if that is refused.
+
+    `state`: the only folder that the service may write in.
+    """
     yield _software()
     yield _processor()
     yield _governor()
-    yield _priority(realtime)
-    yield _memory(realtime)
+    for finding in (_priority(realtime), _memory(realtime), _cores(realtime)):
+        is_refused = finding.verdict is Verdict.WARN
+        yield replace(finding, verdict=Verdict.FAIL) if strict and is_refused else finding
     yield _monotonic()
     yield _wall_clock()
     yield _disk(state)
@@ -99,6 +104,18 @@ def _memory(realtime: Realtime) -> Finding:
         "locking all memory would be refused to this user",
         "install deploy/realtime.conf, or run this check as the service's user",
     )
+
+
+def _cores(realtime: Realtime) -> Finding:
+    """Asks for them as the service does, and gives them back."""
+    if sys.platform != "linux" or realtime.cpus is None:
+        return ok("cores", "any")
+    before = os.sched_getaffinity(0)
+    problems = Realtime(cpus=realtime.cpus).apply()
+    os.sched_setaffinity(0, before)
+    if problems:
+        return warn("cores", problems[0], "give --realtime-cpus some of those")
+    return ok("cores", f"{', '.join(map(str, realtime.cpus))} would be granted")
 
 
 def _monotonic() -> Finding:

@@ -1,8 +1,13 @@
-"""Checks of what the service is made of: profile, model, tile, the port for metrics."""
+"""Checks of what the service is made of: profile, model, tile, where its words go."""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import errno
+import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -10,9 +15,13 @@ from eqrt.core.errors import EqrtError
 from eqrt.runtime.decoding.profile import Profile, load_profile
 from eqrt.runtime.doctor.finding import Finding, fail, ok, warn
 from eqrt.runtime.operation.endpoint import Endpoint
+from eqrt.runtime.output.datagrams import DatagramPublisher
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.runtime.prediction.stored_vectors import read_vector, vector_folders
 from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.recording.folder import free_bytes
+from eqrt.runtime.recording.options import check_folder
+from eqrt.runtime.serve_options import check_outputs, out_channel
 
 _RUNS = 20
 _MOST_OF_A_STEP = 0.25  # for the model; the rest is for decoding, tracks, scene and sending
@@ -73,6 +82,47 @@ def check_metrics(address: str | None, anywhere: bool) -> Finding:
         with Endpoint(address, anywhere=anywhere) as endpoint:
             return ok("metrics", f"{endpoint.address} is free")
     except EqrtError as error:
-        if isinstance(error.__cause__, OSError):
+        cause = error.__cause__
+        if isinstance(cause, OSError) and cause.errno == errno.EADDRINUSE:
             return warn("metrics", str(error), "is that the service itself, already running?")
         return fail("metrics", str(error))
+
+
+def check_datagrams(addresses: Sequence[str]) -> Finding:
+    """Whether there is a way to each."""
+    if not addresses:
+        return ok("datagrams", "not asked for")
+    try:
+        with DatagramPublisher(addresses):
+            return ok("datagrams", f"can be sent to {', '.join(addresses)}")
+    except EqrtError as error:
+        return fail("datagrams", str(error))
+
+
+def check_recording(asked: argparse.Namespace) -> Finding:
+    """Whether this user may write there, and has room; leaves nothing behind."""
+    if asked.record is None:
+        return ok("recording", "not asked for")
+    folder: Path = asked.record.absolute()
+    made = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    try:
+        check_folder(asked)
+        return ok("recording", f"{folder}: can be written, {free_bytes(folder) / 1e9:.1f} GB free")
+    except EqrtError as error:
+        return fail("recording", str(error))
+    finally:
+        for path in made:
+            with contextlib.suppress(OSError):  # it was not made, or is in use by now
+                path.rmdir()
+
+
+def check_output(asked: argparse.Namespace) -> Finding:
+    """Where predictions go on CAN, and whether there are such ids."""
+    try:
+        check_outputs(asked)
+    except EqrtError as error:
+        return fail("output", str(error))
+    channel = out_channel(asked)
+    if channel is None:
+        return ok("output", "not on CAN")
+    return ok("output", f"on {channel}, CAN ids from {asked.out_id:#x} on")

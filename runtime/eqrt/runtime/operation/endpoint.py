@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import AddressError, UsageError
 from eqrt.runtime.operation.metrics import CONTENT_TYPE, Latencies, render
 from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import ServiceStatus
@@ -55,7 +55,8 @@ class Endpoint:
     ) -> None:
         """`address`: `HOST:PORT`; port 0 = any that is free. `anywhere`: not only loopback.
 
-        Raises UsageError if it cannot be listened at, or is not loopback and may not be.
+        Raises UsageError if that is no address, or not loopback and may not be; AddressError if
+        the system does not let it listen there, which may change.
         """
         self._clock = clock
         self._listener = _listener(address, anywhere)
@@ -212,7 +213,8 @@ def _listener(address: str, anywhere: bool) -> socket.socket:
             )
         listener = socket.create_server((str(target[0]), int(target[1])), family=family, backlog=16)
     except (OSError, ValueError) as error:
-        raise UsageError(
+        kind = AddressError if isinstance(error, OSError) else UsageError
+        raise kind(
             f"--metrics {address}: cannot listen there ({error}); give HOST:PORT, such as "
             f"{DEFAULT_ADDRESS}"
         ) from error

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from eqrt.runtime.bus.health import LOST, BusState
 from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import ServiceStatus
 
@@ -20,6 +21,10 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS_S = (0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5)
 """Upper ends of the latency's histogram; the last one is infinity."""
 TOTALS_HELP = "Count since the start (docs/output.md)."
+
+_LOST = {state.name for state in LOST}
+_SAID_BY_CHANNEL = {"bus_not_up", "bus_losses", "bus_error_frames"}
+"""Totals that are no metrics of their own: `eqrt_bus_...` says the same of every channel."""
 
 Labels = dict[str, str]
 Sample = tuple[Labels, float]
@@ -90,8 +95,18 @@ METRICS = (
     Metric(
         "eqrt_bus_up",
         "gauge",
-        "1 while the channel works.",
-        lambda s: [({"channel": bus.channel}, float(bus.state == "UP")) for bus in s.buses],
+        "1 while messages go both ways, also if the controller is error passive.",
+        lambda s: [({"channel": bus.channel}, float(bus.state not in _LOST)) for bus in s.buses],
+    ),
+    Metric(
+        "eqrt_bus_state",
+        "gauge",
+        "1 for the state of the channel, 0 for the others.",
+        lambda s: [
+            ({"channel": bus.channel, "state": state.name}, float(state.name == bus.state))
+            for bus in s.buses
+            for state in BusState
+        ],
     ),
     Metric(
         "eqrt_bus_losses_total",
@@ -130,7 +145,7 @@ METRICS = (
         _one(lambda _: time.process_time()),
     ),
 )
-"""Besides them: the histogram `eqrt_latency_seconds`, and `eqrt_NAME_total` for every total."""
+"""Besides them: the histogram `eqrt_latency_seconds`, and `eqrt_NAME_total` for other totals."""
 
 
 def render(status: ServiceStatus, latencies: Latencies) -> str:
@@ -141,6 +156,8 @@ def render(status: ServiceStatus, latencies: Latencies) -> str:
         lines += [_line(metric.name, *sample) for sample in metric.samples(status)]
     lines += _histogram(latencies)
     for name, count in status.totals.items():
+        if name in _SAID_BY_CHANNEL:
+            continue
         lines += _head(f"eqrt_{name}_total", "counter", TOTALS_HELP)
         lines.append(_line(f"eqrt_{name}_total", {}, count))
     return "\n".join(lines) + "\n"

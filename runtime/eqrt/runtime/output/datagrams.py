@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.errors import UsageError, in_one_line
+from eqrt.core.errors import AddressError, UsageError, in_one_line
 from eqrt.core.frames import Pose2
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
@@ -46,7 +46,10 @@ class DatagramPublisher:
     """Sends every cycle's forecasts to some addresses, without ever waiting."""
 
     def __init__(self, addresses: Iterable[str]) -> None:
-        """`addresses`: `HOST:PORT` each, for example DEFAULT_ADDRESS. Raises UsageError."""
+        """`addresses`: `HOST:PORT` each, for example DEFAULT_ADDRESS.
+
+        Raises UsageError if one is none, AddressError if it is not to be found, which may change.
+        """
         self._addresses = [_resolved(address) for address in addresses]
         families = {family for family, _ in self._addresses}
         self._sockets = {family: _sender(family) for family in families}
@@ -269,7 +272,8 @@ def _resolved(address: str) -> tuple[int, tuple[str, int]]:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
         family, _, _, _, target = found[0]
     except (OSError, ValueError) as error:
-        raise UsageError(
+        kind = AddressError if isinstance(error, OSError) else UsageError
+        raise kind(
             f"cannot send datagrams to {address!r} ({error}); give HOST:PORT, such as "
             f"{DEFAULT_ADDRESS}"
         ) from error

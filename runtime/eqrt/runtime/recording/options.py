@@ -84,7 +84,7 @@ def start_recorder(
     `channels`, `clock` and `runs` are those of the pipeline. Raises RecordingError if nothing can
     be written there.
     """
-    _check(args)
+    check_folder(args)
     order = Order(
         folder=str(args.record.absolute()),
         run=secrets.token_hex(4),
@@ -107,8 +107,11 @@ def start_recorder(
     return Recorder(order, clock, runs)
 
 
-def _check(args: argparse.Namespace) -> None:
-    """What can be known before the first entry is said at the start, where somebody reads it."""
+def check_folder(args: argparse.Namespace) -> None:
+    """What can be known before the first entry is said at the start, where somebody reads it.
+
+    Makes the folder. Raises RecordingError if nothing can be written there.
+    """
     folder: Path = args.record
     try:
         folder.mkdir(parents=True, exist_ok=True)

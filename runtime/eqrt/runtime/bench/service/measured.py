@@ -94,11 +94,11 @@ class _Run:
 
     def serve(self, receiver: Receiver, dt_s: float, should_stop: Callable[[], bool]) -> None:
         """Between two hooks; ends when told to, or when everything has been measured."""
-        journal, bus = self._journal, receiver.connection(self._order.bus.channel)
+        journal, outbox = self._journal, receiver.connection(self._order.bus.channel).outbox
         service = Service(
             self._pipeline,
             NotingReceiver(receiver, journal),
-            [NotingPublisher(CanPublisher(bus), journal)],
+            [NotingPublisher(CanPublisher(outbox), journal)],
             clock=AnsweredClock(journal, dt_s) if self._order.answered_clock else ArrivalClock(),
         )
         gc.collect()
