@@ -86,6 +86,13 @@ def test_a_radar_that_sends_is_heard_and_known() -> None:
     assert "generic is not for what is on this channel" in other[f"ids {channel}"].advice
 
 
+def test_a_map_that_the_profile_has_no_poses_for_is_a_warning() -> None:
+    without = examined("--profile", "ars408", "--tile", str(TILE))["tile"]
+    assert (without.verdict, "lanes" in without.found) == (Verdict.WARN, True)
+    assert "'ars408' gives no poses" in without.advice
+    assert examined("--profile", "generic", "--tile", str(TILE))["tile"].verdict is Verdict.OK
+
+
 def test_a_silent_channel_is_a_warning() -> None:
     channel = f"doctor-{time.monotonic_ns()}"
     found = examined("--can", channel, "--can-interface", LOCAL, "--profile", "ars408")

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from eqrt.core.errors import UsageError
+from eqrt.runtime.advice import unused_map
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.health import in_sum, trouble
 from eqrt.runtime.bus.ids import Ids
@@ -55,10 +56,13 @@ def load_pipeline(
     predictor = Predictor.load(args.model)
     if predictor.license_notice:
         print(f"eqrt: {predictor.license_notice}", file=sys.stderr)
+    tile = load_tile(args.tile) if args.tile else None
+    if warning := unused_map(profile, tile):
+        print(f"eqrt: {warning}", file=sys.stderr)
     return Pipeline(
         profile,
         predictor,
-        load_tile(args.tile) if args.tile else None,
+        tile,
         channels=channels,
         stationary=args.stationary,
         clock=clock,

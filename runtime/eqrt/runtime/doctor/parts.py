@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import median
 
 from eqrt.core.errors import EqrtError
+from eqrt.runtime.advice import unused_map
 from eqrt.runtime.decoding.profile import Profile, load_profile
 from eqrt.runtime.doctor.finding import Finding, fail, ok, warn
 from eqrt.runtime.operation.endpoint import Endpoint
@@ -51,8 +52,8 @@ def check_model(folder: Path) -> Finding:
     return ok("model", found)
 
 
-def check_tile(path: Path | None) -> Finding:
-    """Whether it can be read, and what is in it."""
+def check_tile(path: Path | None, profile: Profile | None) -> Finding:
+    """Whether it can be read, what is in it, and whether the profile lets it be used."""
     if path is None:
         return ok("tile", "none: predictions will be made without a map")
     try:
@@ -62,7 +63,10 @@ def check_tile(path: Path | None) -> Finding:
     info = tile.info
     origin = info.origin_deg
     where = f"origin {origin[0]:.5f}, {origin[1]:.5f}" if origin else "origin not on Earth"
-    return ok("tile", f"{info.name} {info.tile_id}: {tile.lane_map.num_lanes} lanes, {where}")
+    found = f"{info.name} {info.tile_id}: {tile.lane_map.num_lanes} lanes, {where}"
+    if profile is not None and (advice := unused_map(profile, tile)):
+        return warn("tile", found, advice)
+    return ok("tile", found)
 
 
 def check_metrics(address: str | None, anywhere: bool) -> Finding:
