@@ -48,9 +48,7 @@ def test_the_service_says_that_a_map_without_poses_is_not_used() -> None:
 def test_a_map_is_used_where_there_are_poses_for_it(tmp_path: Path) -> None:
     """In its own x and y any map; by latitude and longitude one that says where it is."""
     nowhere = load_tile(other_tile(tmp_path))
-    somewhere = load_tile(
-        other_tile(tmp_path, origin_latitude_deg=48.0, origin_longitude_deg=11.0)
-    )
+    somewhere = load_tile(other_tile(tmp_path, origin_latitude_deg=48.0, origin_longitude_deg=11.0))
     ins, generic = load_profile("sbg-ins"), load_profile("generic")
     assert unused_map(load_profile("ars408"), None) is None
     assert unused_map(generic, nowhere) is None
