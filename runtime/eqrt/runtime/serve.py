@@ -119,6 +119,8 @@ def _serve(args: argparse.Namespace) -> int:
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
         log.line("ready", f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends")
         log.say(Level.INFO, "running", identity(pipeline.predictor, pipeline.tile))
+        for sensor in profile.sensors:
+            log.say(Level.INFO, f"mount-{sensor.name}", f"{sensor.name}: mount {sensor.place}")
         if endpoint is not None:
             log.say(Level.INFO, "metrics", f"http://{endpoint.address}/metrics and /health answer")
         manager.ready()
