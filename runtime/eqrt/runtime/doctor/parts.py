@@ -27,9 +27,12 @@ def check_profile(name: str | None) -> tuple[Profile | None, Finding]:
         profile = load_profile(name)
     except EqrtError as error:
         return None, fail("profile", str(error))
-    sensors = ", ".join(sensor.name for sensor in profile.sensors) or "no sensor"
-    ids = len(profile.arbitration_ids)
-    return profile, ok("profile", f"{profile.name}: {sensors}; {ids} CAN ids")
+    count, ids = len(profile.sensors), len(profile.arbitration_ids)
+    gives = [f"{count or 'no'} sensor{'' if count == 1 else 's'}"]
+    for key in ("speed", "yaw_rate", "pose"):
+        words = key.replace("_", " ")
+        gives.append(words if profile.gives(key) else f"no {words}")
+    return profile, ok("profile", f"{profile.name}: {', '.join(gives)}; {ids} CAN ids")
 
 
 def check_model(folder: Path) -> Finding:
