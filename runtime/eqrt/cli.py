@@ -8,6 +8,7 @@ budget is broken or something became slower.
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import importlib.metadata
 import sys
@@ -168,8 +169,9 @@ def _top_level(argv: list[str]) -> int:
         parser.print_help()
         return 2
     parser.parse_known_args(argv)
-    close = ", ".join(COMMANDS)
-    raise UsageError(f"there is no command {argv[0]!r}; the commands are {close}")
+    near = difflib.get_close_matches(argv[0], COMMANDS, n=1)
+    advice = f"did you mean {near[0]!r}?" if near else f"the commands are {', '.join(COMMANDS)}"
+    raise UsageError(f"there is no command {argv[0]!r}; {advice}")
 
 
 if __name__ == "__main__":

@@ -122,8 +122,9 @@ def replays() -> Iterator[str]:
         "rav4": DRIVES["rav4"],
         "ars408": DRIVES["ars408"],
     }
-    yield f"{'':14}{'log':>7} {'x real':>7} {'cycles':>7} {'predictions':>12} {'scored':>7}" + (
-        f"{'ADE 3 s eqrt, const. velocity':>32}{'FDE 3 s':>16}"
+    yield (
+        f"{'':14}{'log':>7} {'x real':>7} {'cycles':>7} {'predictions':>12} {'scored':>7} "
+        f"{'young':>7}{'ADE 3 s eqrt, const. velocity':>32}{'FDE 3 s':>16}"
     )
     for name, drive in logs.items():
         messages = list(read_log(drive.log))
@@ -140,7 +141,9 @@ def replays() -> Iterator[str]:
 
 
 def scores(forecasts: Iterable[ForecastSet]) -> str:
-    """How many could be scored, and ADE and FDE of eqrt and of constant velocity."""
+    """How many could be scored, and how many could not but for the youth of their tracks; ADE and
+    FDE of eqrt and of constant velocity.
+    """
     board = Scoreboard()
     for forecast in forecasts:
         board.add(forecast)
@@ -148,7 +151,7 @@ def scores(forecasts: Iterable[ForecastSet]) -> str:
         return "none"
     ours, baseline = board.tables()
     ade, fde = (f"{ours[key]:7.2f} {baseline[key]:7.2f}" for key in ("ade_3s", "fde_3s"))
-    return f"{board.count:7,} {ade:>31} {fde:>15}"
+    return f"{board.count:7,} {board.too_young:7,} {ade:>31} {fde:>15}"
 
 
 # --- the service, in a process of its own

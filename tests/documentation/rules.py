@@ -29,7 +29,7 @@ NOT_RUN = (
     NotRun(
         r"", r"make ", "sets up environments; CI makes its targets; here make says how it would"
     ),
-    NotRun(r"", r"pip install ", "would change the environment that runs the tests"),
+    NotRun(r"", r"python3 -m venv .venv ", "makes an environment; tests/packaging installs eqrt"),
     NotRun(r"deploy/README", r"sudo ", "changes the machine; vcan.sh is tried in tests/socketcan"),
     NotRun(r"reliability", r"echo .* \| sudo tee ", "changes the machine"),
     NotRun(r"deploy/README", r"journalctl ", "needs a running systemd"),

@@ -40,6 +40,7 @@ def build(folder: Path) -> Path:
     _write_configs(folder / "training/configs")
     _write_recordings(folder)
     _write_drive(folder)
+    _write_profile(folder)
     _write_maps(folder)
     for name in ("ARTIFACT", "DIR", "A"):
         (folder / name).symlink_to(DEFAULT_ARTIFACT)
@@ -128,6 +129,13 @@ def _write_fleet(folder: Path) -> None:
 def _write_drive(folder: Path) -> None:
     with gzip.open(ROOT / "tests/data/can/ars408/candump.log.gz", "rt") as log:
         (folder / "drive.log").write_text("".join(log.readlines()[:_LOG_LINES]))
+
+
+def _write_profile(folder: Path) -> None:
+    """What the reader of docs/radar-ins-map.md saves."""
+    page = (ROOT / "docs/radar-ins-map.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"Save this as.*?^```toml\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    (folder / "radar-ins.toml").write_text(block, encoding="utf-8")
 
 
 def _write_maps(folder: Path) -> None:

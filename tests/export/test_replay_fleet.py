@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from drives import DRIVES, first_seconds
-from eqrt.core.errors import LogError, ProfileError, UsageError
+from eqrt.core.errors import EqrtError, LogError, ProfileError, UsageError
 from eqrt.export import replay_fleet
 from eqrt.runtime import replay
 
@@ -153,5 +153,19 @@ def test_what_no_log_could_be_replayed_with_is_said_at_once(folder: Path, tmp_pa
 
 def test_an_output_that_cannot_be_written_is_one_line(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(UsageError, match=r"cannot write into .*; give --out a folder"):
+    with pytest.raises(EqrtError, match=r"cannot write into .*; give --out a folder"):
+        run(folder, tmp_path / "out")
+
+
+def test_a_log_without_predictions_counts_as_failed(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of another sensor: the reason is said, and nothing is left that looks done."""
+    (folder / "other.log").write_text(first_seconds(DRIVES["ars408"].log, 1.0))
+    assert run(folder, tmp_path / "out", "--keep-going") == 0
+    out, err = capsys.readouterr()
+    assert "other.log: no predictions: none of the " in err
+    assert out.splitlines()[-1].endswith(f"{len(LOGS)} logs, 1 failed")
+    assert not [name for name in files_in(tmp_path / "out") if name.startswith("other")]
+    with pytest.raises(LogError, match="no predictions"):
         run(folder, tmp_path / "out")

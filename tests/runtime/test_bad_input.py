@@ -172,17 +172,17 @@ CASES: list[tuple[str, int, str]] = [  # command line, status, what is said
     # Outputs
     (
         f"replay {LOG} --profile srr520 --out missing/out.jsonl",
-        2,
+        1,
         r"cannot write missing/out\.jsonl \(",
     ),
     (
         f"replay {LOG} --profile srr520 --out file/out.jsonl",
-        2,
+        1,
         r"cannot write file/out\.jsonl \(Not a",
     ),
     (
         f"replay {LOG} --profile srr520 --out .",
-        2,
+        1,
         r"cannot write \. \(Is a directory\); give --out a",
     ),
     ("demo --seconds 0", 2, r"--seconds is 0\.0; give a number above 0"),
@@ -247,7 +247,7 @@ def test_a_missing_channel_says_how_to_get_one(
 
 @LINUX
 def test_a_full_disk_is_said(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", LOG, "--profile", "srr520", "--out", "/dev/full"]) == 2
+    assert main(["replay", LOG, "--profile", "srr520", "--out", "/dev/full"]) == 1
     assert capfd.readouterr().err == (
         "eqrt: cannot write /dev/full (No space left on device); "
         "give --out a file that can be written\n"

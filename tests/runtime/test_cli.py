@@ -35,11 +35,32 @@ def test_without_a_command_the_help_is_shown_and_the_status_says_usage(
 
 
 def test_an_unknown_command_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sevre"]) == 2
+    assert cli.main(["predict"]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
-    assert captured.err.startswith("eqrt: there is no command 'sevre'; the commands are demo, ")
+    assert captured.err.startswith("eqrt: there is no command 'predict'; the commands are demo, ")
+
+
+@pytest.mark.parametrize("wrong", ["serv", "sevre", "server"])
+def test_a_command_with_a_slip_of_the_finger_is_guessed(
+    wrong: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([wrong]) == 2
+    said = f"eqrt: there is no command {wrong!r}; did you mean 'serve'?\n"
+    assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize(("command", "actions"), [("can", ["check"]), ("tile", ["info", "build"])])
+def test_a_command_with_actions_lists_each_once(
+    command: str, actions: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert usage == f"usage: eqrt {command} [-h] COMMAND ..."
+    for action in actions:
+        assert len([line for line in lines if line.startswith(f"    {action} ")]) == 1
 
 
 def test_python_dash_m_is_the_same_command() -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
+from drives import first_seconds
 from eqrt.cli import main
-from eqrt.runtime.demo.command import PARTS
+from eqrt.runtime.demo.command import PARTS, play_part
 from processes import eqrt
 
 LINE = re.compile(r"  +\d+ s  (RUN|LATE) +\d+ objects +\d+\.\d ms")
@@ -37,6 +39,10 @@ def test_the_demo_shows_predictions_against_what_happened(
     assert re.search(r"ADE 3 s +\d+\.\d\d m \(constant velocity +\d+\.\d\d\)", seconds[-1])
     first, second = [match for line in lines if (match := TABLE.fullmatch(line))]
     assert (first[1], second[1]) == ("eqrt", "constant velocity")
+    heads = [line for line in lines if line.split()[:3] == ["time", "mode", "compute"]]
+    assert lines.index(heads[0]) < lines.index(seconds[0])
+    assert re.search(r"verdict +after 3 s, eqrt is \d+% (nearer to|farther from) ", done.stdout)
+    assert lines[-1] == "next: with your own radar, docs/start-radar.md"
     scored = next(line for line in lines if "predictions scored" in line)
     assert int(scored.split()[0]) > 50
 
@@ -70,8 +76,21 @@ def test_pictures_that_cannot_be_written_are_known_before_the_minute(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").touch()
-    assert main(["demo", "--out", str(tmp_path / "file")]) == 2
+    assert main(["demo", "--out", str(tmp_path / "file")]) == 1
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith(f"eqrt: cannot write pictures to {tmp_path / 'file'} (")
     assert err.count("\n") == 1
+
+
+def test_a_recording_that_has_ended_is_said_to_have(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Once, and no line about the silence after it."""
+    log = tmp_path / "short.log"
+    log.write_text(first_seconds(PARTS[0].log, 3.0))
+    play_part(replace(PARTS[0], log=log), None)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "  (end of recording)"
+    assert len([line for line in lines if LINE.match(line)]) >= 1
+    assert not [line for line in lines if "SILENT" in line]

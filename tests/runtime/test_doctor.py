@@ -26,6 +26,7 @@ from eqrt.runtime.doctor.bus import (
     room_of,
 )
 from eqrt.runtime.doctor.finding import Finding, Verdict
+from eqrt.runtime.doctor.parts import check_profile
 from eqrt.runtime.operation.endpoint import Endpoint
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from processes import eqrt
@@ -92,6 +93,24 @@ def test_a_radar_that_sends_is_heard_and_known() -> None:
     assert "lanes" in found["tile"].found
     assert other[f"ids {channel}"].verdict is Verdict.WARN
     assert "generic is not for what is on this channel" in other[f"ids {channel}"].advice
+
+
+def test_a_map_that_the_profile_has_no_poses_for_is_a_warning() -> None:
+    without = examined("--profile", "ars408", "--tile", str(TILE))["tile"]
+    assert (without.verdict, "lanes" in without.found) == (Verdict.WARN, True)
+    assert "'ars408' gives no poses" in without.advice
+    assert examined("--profile", "generic", "--tile", str(TILE))["tile"].verdict is Verdict.OK
+
+
+def test_what_a_profile_gives_is_told() -> None:
+    """A map needs a pose, predictions speed and yaw rate."""
+    known = {
+        "ars408": "ars408: 1 sensor, speed, yaw rate, no pose; 6 CAN ids",
+        "sbg-ins": "sbg-ins: no sensors, speed, yaw rate, pose; 5 CAN ids",
+        "srr520": "srr520: 1 sensor, no speed, no yaw rate, no pose; ",
+    }
+    for name, found in known.items():
+        assert check_profile(name)[1].found.startswith(found)
 
 
 def test_a_silent_channel_is_a_warning() -> None:

@@ -132,6 +132,18 @@ def test_modes_are_told_when_they_change(quiet: ServiceStatus) -> None:
     assert set(MODES) == set(Mode)
 
 
+def test_without_ego_motion_or_pose_the_log_says_what_to_do(quiet: ServiceStatus) -> None:
+    """No objects: the motion is not known. Objects and a tile: the place on the map is not."""
+    speed = SourceStatus(name="ego SpeedInformation", valid=False, reason="", since_s=1.0)
+    radar = SourceStatus(name="ars408", valid=True, reason="", since_s=1.0)
+    no_pose = msgspec.structs.replace(quiet, mode=int(Mode.NO_POSE), sources=[radar, speed])
+    still = told(no_pose)[0]
+    assert "(SpeedInformation not on the bus)" in still
+    assert still.endswith("or say --stationary if the sensor stands still")
+    lost = msgspec.structs.replace(no_pose, tile="/town.tile", objects=3)
+    assert told(lost)[0].endswith("where on the map the car is: docs/radar-ins-map.md")
+
+
 def test_buses_that_come_and_go_are_told(quiet: ServiceStatus) -> None:
     def with_bus(state: str, overflow: int) -> ServiceStatus:
         bus = BusStatus(channel="can0", state=state, since_s=1.0, overflow=overflow)

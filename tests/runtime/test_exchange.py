@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -156,3 +157,17 @@ def test_the_origin_is_that_of_the_tile_from_the_start_and_after_an_exchange(
         assert place is not None
         east_m.append(place.x_m)
     np.testing.assert_allclose(east_m, [37_300.0, 0.0, 18_650.0], atol=50.0)
+
+
+def test_a_map_that_is_nowhere_on_earth_has_no_place_for_latitudes_and_longitudes(
+    geodetic: Callable[[float, float], Pipeline],
+) -> None:
+    """The first pose is not its origin: its lanes would lie anywhere."""
+    here = message(EGO, (480).to_bytes(2, "little") + (115).to_bytes(2, "little") + bytes(4))
+    pipeline = geodetic(math.nan, math.nan)
+    for now_s in (0.0, 0.1):
+        pipeline.feed(here, now_s)
+    assert pipeline.ego.map_from_ego(0.1) is None
+    epoch = pipeline.ego.epoch
+    exchanged(pipeline, shipped_predictor(), pipeline.tile)
+    assert pipeline.ego.epoch == epoch

@@ -116,6 +116,14 @@ def test_traffic_goes_to_the_right_and_left_is_up(way: tuple[float, float]) -> N
     assert arrow @ north == pytest.approx(np.hypot(*arrow), rel=0.01)
 
 
+def test_where_north_is_not_known_no_arrow_points_there() -> None:
+    """Without a pose in a map, y is only where the car looked when it began."""
+    moment = Moment(title="", is_north_known=False)
+    moment.lines["truth"].append(np.array([(0.0, 0.0), (100.0, 0.0)]))
+    assert not list(drawn(moment).iter(f"{SVG}polygon"))
+    assert "N" not in [text.text for text in drawn(moment).iter(f"{SVG}text")]
+
+
 @pytest.mark.parametrize("far_m", [0.0, 30.0, 3000.0])
 def test_everything_but_lanes_is_inside_the_picture(far_m: float) -> None:
     """Also when somebody is far away, or all stand on one point."""
@@ -157,6 +165,10 @@ def test_the_best_moment_of_a_drive_shows_who_moved() -> None:
     assert moment is not None
     assert len(moment.agents) >= 10
     assert moment.lanes
+    assert moment.is_north_known
+    without = best.picture(None)
+    assert without is not None
+    assert not without.is_north_known
     for name in ("truth", "predicted", "constant velocity"):
         starts = np.array([path[0] for path in moment.lines[name]])
         np.testing.assert_allclose(starts, moment.agents)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -182,20 +183,67 @@ def test_a_device_is_written_and_stays_a_device(log: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "objects"),
+    ("options", "objects", "status"),
     [
-        (["--can", "radar=can1", "--can", "car=can0"], True),
-        (["--can", "radar=can0", "--can", "car=can1"], False),
-        (["--can", "can1"], True),
-        (["--can", "can0"], False),
+        (["--can", "radar=can1", "--can", "car=can0"], True, 0),
+        (["--can", "radar=can0", "--can", "car=can1"], False, 1),
+        (["--can", "can1"], True, 1),  # nothing tells how the car moves
+        (["--can", "can0"], False, 1),
     ],
 )
 def test_only_the_named_channels_of_a_log_are_read(
-    options: list[str], objects: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str],
+    objects: bool,
+    status: int,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The RAV4's radar is on can1, its wheels are on can0."""
     log = tmp_path / "drive.log"
     log.write_text(first_seconds(DRIVES["rav4"].log, 1.0))
-    assert run(log, tmp_path / "out.jsonl", *DRIVES["rav4"].options, *options) == 0
+    assert run(log, tmp_path / "out.jsonl", *DRIVES["rav4"].options, *options) == status
     found = int(capsys.readouterr().err.split(" cycles, ")[1].split()[0])
     assert (found > 0) == objects
+
+
+def test_a_replay_counts_its_cycles_by_mode(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(log, tmp_path / "out.jsonl") == 0
+    assert capsys.readouterr().err.endswith("; cycles by mode: RUN 20\n")
+
+
+@pytest.mark.parametrize(
+    ("profile", "without", "reason"),
+    [
+        ("toyota-rav4", "", " messages is one that the profile 'toyota-rav4' reads"),
+        ("ars408", " 60A#", "no object list came"),
+        ("ars408", " 60B#", "all object lists are empty"),
+        ("ars408", " 300#", "nothing tells the car's speed and yaw rate (SpeedInformation not on"),
+        ("ars408", " 30[01]#", "(SpeedInformation, YawRateInformation not on the bus)"),
+    ],
+)
+def test_a_replay_without_predictions_says_why_and_fails(
+    profile: str, without: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And leaves what was there."""
+    log, out = tmp_path / "drive.log", tmp_path / "out.jsonl"
+    lines = first_seconds(DRIVES["ars408"].log, 1.0).splitlines(keepends=True)
+    log.write_text("".join(one for one in lines if not (without and re.search(without, one))))
+    out.write_text("yesterday's\n")
+    assert run(log, out, "--profile", profile) == 1
+    summary, said = capsys.readouterr().err.splitlines()
+    assert " 0 predictions in " in summary
+    assert said.startswith("eqrt: no predictions: ")
+    assert reason in said
+    assert out.read_text() == "yesterday's\n"
+
+
+def test_a_profile_without_a_sensor_predicts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One for an INS alone, which is there."""
+    log = tmp_path / "drive.log"
+    log.write_text("(1.0) can0 134#0000000000000000\n")
+    assert run(log, tmp_path / "out.jsonl", "--profile", "sbg-ins") == 1
+    assert "'sbg-ins' has no [[sensor]]" in capsys.readouterr().err

@@ -155,6 +155,7 @@ def test_a_gap_in_the_truth_is_not_bridged() -> None:
     assert len(gap) * DT_S > MAX_GAP_S
     anchors = sorted({round(10 * s.anchor_s) for s in scored})
     assert anchors[0] == 31  # 2.6 s and half a second
+    assert board.too_young == 5  # from 2.6 s to then
     assert anchors[-1] == 67  # the last whose 3.3 s end by 10.0 s
 
 

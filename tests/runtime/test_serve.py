@@ -172,6 +172,8 @@ def test_a_service_says_when_it_is_ready_and_how_it_went(
     assert (one.status, one.stderr) == (0, "")
     *lines, summary = one.stdout.splitlines()
     assert len(lines) >= SECONDS
+    for sensor in load_profile(one.drive.profile).sensors:
+        assert f" {sensor.name}: mount x {sensor.mount.x_m:g} m, " in one.stdout
     targets = sum(forecast.num_targets for forecast in one.forecasts)
     assert summary.startswith("eqrt serve: ")
     assert f" {targets} predictions, " in summary

@@ -18,9 +18,10 @@ from pathlib import Path
 
 import msgspec
 
-from eqrt.core.errors import LogError, UsageError
+from eqrt.core.errors import EqrtError, LogError
 from eqrt.export.can_recordings import find_logs
 from eqrt.export.cluster import add_worker_arguments, run_pieces
+from eqrt.runtime.advice import no_predictions
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.decoding.profile import load_profile
@@ -60,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep-going",
         action="store_true",
-        help="count logs that cannot be replayed and go on (default: stop at the first)",
+        help="count logs that cannot be replayed, or that give no prediction, and go on (default: "
+        "stop at the first)",
     )
 
 
@@ -181,7 +183,9 @@ class Replayer:
         self._pipeline()
 
     def __call__(self, piece: LogToReplay) -> Replayed:
-        """Replay, or find that it was done. Raises LogError and what `check` raises."""
+        """Replay, or find that it was done. Raises LogError, also if no prediction came out, and
+        what `check` raises.
+        """
         made_with = self._made_with(piece.log)
         known = _read_page(piece)
         if known is not None and known.made_with == made_with:
@@ -190,7 +194,7 @@ class Replayer:
             piece.out.parent.mkdir(parents=True, exist_ok=True)
             piece.page.unlink(missing_ok=True)
         except OSError as error:
-            raise UsageError(
+            raise EqrtError(
                 f"cannot write into {piece.out.parent} ({error.strerror}); give --out a folder "
                 "that can be written"
             ) from error
@@ -204,6 +208,8 @@ class Replayer:
         with output(str(piece.lines)) as lines:
             for forecast in replay(pipeline, log):
                 lines.write(json_lines(forecast))
+            if not pipeline.counters.targets:
+                raise LogError(f"{piece.log}: no predictions: {no_predictions(pipeline)}")
         decoded, counters = pipeline.decoder.counters, pipeline.counters
         return Replayed(
             messages=log.messages,

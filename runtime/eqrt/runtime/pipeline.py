@@ -105,7 +105,7 @@ class Pipeline:
         pipeline's time while it computes; None = no time passes (replay). `run_by` makes what runs
         the model; None = Watched with a clock, Direct without.
         """
-        self.decoder = Decoder(profile, channels, tile.info.origin_deg if tile else None)
+        self.decoder = Decoder(profile, channels, _origin_of(tile))
         self.ego = EgoTracker(
             yaw_rate_bias_rad_s=profile.yaw_rate_bias_rad_s,
             stationary=stationary or not profile.has_ego,
@@ -159,8 +159,7 @@ class Pipeline:
         Tracks and ego motion stay, unless poses come as latitude and longitude and the new tile's
         map frame has its origin elsewhere: then poses begin anew there, and histories with them.
         """
-        origin_before = self.tile.info.origin_deg if self.tile else None
-        origin = tile.info.origin_deg if tile else None
+        origin_before, origin = _origin_of(self.tile), _origin_of(tile)
         self.predictor, self.tile = predictor, tile
         self._runner = self._runner.succeeded_by(predictor)
         self.tracks.reach(predictor.contract.history_steps, predictor.contract.dt_s)
@@ -296,9 +295,15 @@ class _Moment:
     """Work on it began."""
 
 
+def _origin_of(tile: Tile | None) -> tuple[float, float] | None:
+    """Of the map frame, as `Decoder` takes it: what a tile does not know is not the first pose."""
+    return None if tile is None else tile.info.origin_deg or _NOWHERE
+
+
 def lanes_for(tile: Tile | None, predictor: Model) -> CenterlineSource | None:
     """The tile's lanes as the model wants them chosen; takes milliseconds."""
     return centerline_source(tile.lane_map, predictor.contract) if tile else None
 
 
 _NOTHING: list[ForecastSet] = []
+_NOWHERE = (np.nan, np.nan)

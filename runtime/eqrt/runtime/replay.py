@@ -13,17 +13,19 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import can
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError, UsageError
+from eqrt.runtime.advice import no_predictions
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.decoding.profile import load_profile
-from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
@@ -41,9 +43,10 @@ PARTLY = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt replay`."""
     parser.epilog = (
-        "example: eqrt replay drive.log --profile ars408 --out predictions.jsonl. Exit status with "
-        "--diff: 0 the runs are identical, 1 they differ. 3: some cycles of a recording cannot be "
-        "made again and are left out, because their model is not here; all else is well"
+        "example: eqrt replay drive.log --profile ars408 --out predictions.jsonl. Exit status: 1 "
+        "if no prediction came out (and why is said). With --diff: 0 the runs are identical, 1 "
+        "they differ. 3: some cycles of a recording cannot be made again and are left out, because "
+        "their model is not here; all else is well"
     )
     parser.add_argument(
         "log",
@@ -87,27 +90,53 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("where should the predictions go? give --out FILE, or --diff RUN")
     replayed = _replay_of(args, args.model)
     out_name = args.out if args.out is not None else os.devnull
+    compares = args.diff is not None or args.diff_model is not None
+    modes: Counter[Mode] = Counter()
     started_s = time.perf_counter()
     with output(out_name) as out:
-        lines = _written(replayed, out)
-        if args.diff is None and args.diff_model is None:
-            for _ in lines:
-                pass
-            status = 0
-        else:
-            status = _compare(args, lines, replayed)
-    seconds = time.perf_counter() - started_s
-    if replayed.remark:
-        print(f"eqrt: {replayed.remark}", file=sys.stderr)
-    for part in replayed.left_out:
-        print(f"eqrt: {part}", file=sys.stderr)
-    print(f"eqrt replay: {replayed.summary()} in {seconds:.1f} s", file=sys.stderr)
+        lines = _written(replayed, out, modes)
+        status = _compare(args, lines, replayed) if compares else _exhaust(lines)
+        if not (compares or replayed.left_out or _predictions(replayed)):
+            _say(replayed, modes, time.perf_counter() - started_s)
+            raise EqrtError(f"no predictions: {no_predictions(replayed.pipelines[-1])}")
+    _say(replayed, modes, time.perf_counter() - started_s)
     return PARTLY if status == 0 and replayed.left_out else status
 
 
-def _written(replayed: _LogReplay | _RecordingReplay, out: BinaryIO) -> Iterator[bytes]:
-    """The JSON lines of a replay, each written as it is made."""
+def _exhaust(lines: Iterator[bytes]) -> int:
+    for _ in lines:
+        pass
+    return 0
+
+
+def _predictions(replayed: _LogReplay | _RecordingReplay) -> int:
+    return sum(one.counters.targets for one in replayed.pipelines)
+
+
+def _say(
+    replayed: _LogReplay | _RecordingReplay, modes: Mapping[Mode, int], seconds: float
+) -> None:
+    """What went in and came out, after what could not be read or made."""
+    for remark in filter(None, (replayed.remark, *map(str, replayed.left_out))):
+        print(f"eqrt: {remark}", file=sys.stderr)
+    decoded = [one.decoder.counters for one in replayed.pipelines]
+    text = (
+        f"{replayed.messages} messages, {sum(one.cycles for one in decoded)} cycles, "
+        f"{sum(one.objects for one in decoded)} objects, {_predictions(replayed)} predictions "
+        f"in {seconds:.1f} s"
+    )
+    if modes:
+        counts = (f"{mode.name} {count}" for mode, count in sorted(modes.items()))
+        text += f"; cycles by mode: {', '.join(counts)}"
+    print(f"eqrt replay: {text}", file=sys.stderr)
+
+
+def _written(
+    replayed: _LogReplay | _RecordingReplay, out: BinaryIO, modes: Counter[Mode]
+) -> Iterator[bytes]:
+    """The JSON lines of a replay, each written as it is made; counts the modes of its cycles."""
     for forecast in replayed:
+        modes[forecast.mode] += 1
         lines = json_lines(forecast)
         out.write(lines)
         yield from lines.splitlines()
@@ -170,10 +199,10 @@ class _LogReplay:
         profile = load_profile(args.profile)
         channels = parse_channels(args.can, profile.roles)
         args = argparse.Namespace(**vars(args) | {"model": model or DEFAULT_ARTIFACT})
-        self._pipeline = load_pipeline(args, profile, channels or None, clock=None)
+        self.pipelines = [load_pipeline(args, profile, channels or None, clock=None)]
 
     def __iter__(self) -> Iterator[ForecastSet]:
-        return replay(self._pipeline, self._log)
+        return replay(self.pipelines[0], self._log)
 
     def is_left_out(self, time_s: float) -> bool:
         """A log is replayed whole."""
@@ -185,9 +214,10 @@ class _LogReplay:
         """What could not be read."""
         return self._log.remark
 
-    def summary(self) -> str:
-        """What went in and came out."""
-        return _summary(self._log.messages, [self._pipeline])
+    @property
+    def messages(self) -> int:
+        """How many were read."""
+        return self._log.messages
 
 
 class _RecordingReplay:
@@ -241,17 +271,15 @@ class _RecordingReplay:
         """Whether a cycle, at that time in JSON lines, is one of them."""
         return any(time_s in part.times_s for part in self.left_out)
 
-    def summary(self) -> str:
-        """What went in and came out."""
-        pipelines = [one.pipeline for one in self._replays]
-        return _summary(sum(one.messages for one in self._recordings), pipelines)
+    @property
+    def messages(self) -> int:
+        """How many were read."""
+        return sum(one.messages for one in self._recordings)
 
-
-def _summary(messages: int, pipelines: list[Pipeline]) -> str:
-    cycles = sum(one.decoder.counters.cycles for one in pipelines)
-    objects = sum(one.decoder.counters.objects for one in pipelines)
-    targets = sum(one.counters.targets for one in pipelines)
-    return f"{messages} messages, {cycles} cycles, {objects} objects, {targets} predictions"
+    @property
+    def pipelines(self) -> list[Pipeline]:
+        """Of the recordings so far."""
+        return [one.pipeline for one in self._replays]
 
 
 def replay(pipeline: Pipeline, messages: Iterable[can.Message]) -> Iterator[ForecastSet]:
@@ -280,7 +308,7 @@ def output(name: str) -> Iterator[BinaryIO]:
         if not in_place:
             os.replace(written, path)
     except OSError as error:
-        raise UsageError(
+        raise EqrtError(
             f"cannot write {path} ({error.strerror}); give --out a file that can be written"
         ) from error
     finally:

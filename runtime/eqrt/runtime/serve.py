@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
+from eqrt.runtime.advice import unused_map
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.health import in_sum, trouble
 from eqrt.runtime.bus.ids import Ids
@@ -54,10 +55,13 @@ def load_pipeline(
     predictor = Predictor.load(args.model)
     if predictor.license_notice:
         print(f"eqrt: {predictor.license_notice}", file=sys.stderr)
+    tile = load_tile(args.tile) if args.tile else None
+    if warning := unused_map(profile, tile):
+        print(f"eqrt: {warning}", file=sys.stderr)
     return Pipeline(
         profile,
         predictor,
-        load_tile(args.tile) if args.tile else None,
+        tile,
         channels=channels,
         stationary=args.stationary,
         clock=clock,
@@ -115,6 +119,8 @@ def _serve(args: argparse.Namespace) -> int:
         gc.freeze()  # what is loaded now stays: the collector need not look at it again
         log.line("ready", f"eqrt serve: {profile.name} on {', '.join(heard)}; Ctrl-C ends")
         log.say(Level.INFO, "running", identity(pipeline.predictor, pipeline.tile))
+        for sensor in profile.sensors:
+            log.say(Level.INFO, f"mount-{sensor.name}", f"{sensor.name}: mount {sensor.place}")
         if endpoint is not None:
             log.say(Level.INFO, "metrics", f"http://{endpoint.address}/metrics and /health answer")
         manager.ready()

@@ -24,7 +24,7 @@ NO_CHANNEL = "none"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt serve`."""
-    parser.epilog = "example: eqrt serve --can can0 --profile ars408 --tile town.tile"
+    parser.epilog = "example: eqrt serve --can can0 --profile generic --tile town.tile"
     add_pipeline_arguments(parser)
     _add_channels(parser)
     _add_outputs(parser)
@@ -171,7 +171,8 @@ def add_pipeline_arguments(parser: argparse.ArgumentParser, *, of_recordings: bo
         "--tile",
         type=Path,
         metavar="FILE",
-        help="the map around, from `eqrt tile build` (default: predict without a map)",
+        help="the map around, from `eqrt tile build`; used where the profile gives poses (default: "
+        "predict without a map)",
     )
     parser.add_argument(
         "--stationary",

@@ -23,7 +23,7 @@ from eqrt.runtime.prediction.tiles import Tile, load_tile, save_tile
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """`info FILE` and `build SOURCE --out FILE`."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="info|build")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="COMMAND")
     info = actions.add_parser("info", help="say what a tile holds", allow_abbrev=False)
     info.add_argument("tile", type=Path, metavar="FILE")
     build = actions.add_parser("build", help="build a tile from a map", allow_abbrev=False)

@@ -129,8 +129,6 @@ def test_stages_add_up_also_when_a_prediction_needs_several_runs_of_the_graph() 
         (["--cpus", "x"], "--cpus 'x': give cores as in 0 or 0,2-3"),
         (["--cpus", "3-1"], "--cpus '3-1': give cores as in 0 or 0,2-3"),
         (["--cpus", "4000"], "--cpus 4000: not cores of this machine"),
-        (["--json", "nowhere/report.json"], "nowhere/report.json: cannot be written"),
-        (["--html", "."], r"\.: cannot be written"),
     ],
 )
 def test_wrong_usage_is_refused_in_one_line_before_anything_is_measured(
@@ -139,6 +137,22 @@ def test_wrong_usage_is_refused_in_one_line_before_anything_is_measured(
     with pytest.raises(UsageError, match=said) as error:
         bench(*arguments)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--json", "nowhere/report.json"], "nowhere/report.json: cannot be written"),
+        (["--html", "."], r"\.: cannot be written"),
+    ],
+)
+def test_a_report_that_cannot_be_written_is_known_before_anything_is_measured(
+    arguments: list[str], said: str
+) -> None:
+    """The command line is right; the folder is not, and that can be mended: status 1."""
+    with pytest.raises(EqrtError, match=said) as error:
+        bench(*arguments)
+    assert error.value.exit_code == 1
 
 
 def test_a_folder_that_is_no_artifact_is_refused(tmp_path: Path) -> None:

@@ -247,6 +247,24 @@ def test_a_log_without_object_cycles_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("without", "named"),
+    [("300#", "(SpeedInformation not on the bus)"), ("30", "(SpeedInformation, YawRateInform")],
+)
+def test_a_log_that_tells_no_motion_is_refused_at_once(
+    without: str, named: str, tmp_path: Path
+) -> None:
+    """Unless the sensor stands still."""
+    log = tmp_path / "parked.log"
+    lines = first_seconds(DRIVES["ars408"].log, 1.0).splitlines(keepends=True)
+    log.write_text("".join(line for line in lines if f" {without}" not in line))
+    with pytest.raises(EqrtError, match="NO_POSE: nothing tells the car's speed and yaw") as error:
+        objects_in(log, "ars408")
+    assert named in str(error.value)
+    assert "--stationary" in str(error.value)
+    assert objects_in(log, "ars408", stationary=True) >= 1
+
+
+@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--objects", "8"], "--objects is for --service, not for the model alone"),

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bus.candump import candump_line
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.recording.reader import Recording, read_recordings
@@ -64,7 +64,7 @@ def _rosbag2(recordings: list[Recording], out: str) -> tuple[int, str]:
     try:
         return write_rosbag2(recordings, Path(out)), "messages"
     except OSError as error:
-        raise UsageError(f"cannot write {out} ({error.strerror})") from error
+        raise EqrtError(f"cannot write {out} ({error.strerror})") from error
 
 
 def _candump(recordings: list[Recording], out: str) -> tuple[int, str]:

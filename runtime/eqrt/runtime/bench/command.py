@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError
 from eqrt.runtime.bench import options
 from eqrt.runtime.bench.baseline import Comparison, compare, load_baseline
 from eqrt.runtime.bench.budget import Budget, broken, check_duty, load_budget
@@ -110,7 +110,7 @@ def _write(path: Path | None, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror})") from error
+        raise EqrtError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _say(lines: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bench.percentiles import samples_needed
 from eqrt.runtime.bench.report import (
     BACK_TO_BACK,
@@ -245,7 +245,7 @@ def check_writable(*paths: Path | None) -> None:
     """Now, because minutes later a report would be lost."""
     for path in paths:
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
-            raise UsageError(f"{path}: cannot be written; give a file in a folder that exists")
+            raise EqrtError(f"{path}: cannot be written; give a file in a folder that exists")
 
 
 def _rate(args: argparse.Namespace, benchmark: str, schedule: str) -> float | None:

@@ -81,6 +81,7 @@ def _sensor(
     return Sensor(
         name=sensor.name,
         velocity=sensor.velocity_kind.name.lower(),
+        mount=sensor.place,
         cycles=rhythm(np.array([one.timestamp_s for one in cycles]), seen),
         incomplete=sum(not one.complete for one in cycles),
         objects=len(objects.time_s),

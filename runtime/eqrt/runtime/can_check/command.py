@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError
 from eqrt.runtime.bench.json_form import to_json
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
@@ -22,7 +22,7 @@ from eqrt.runtime.decoding.profile import load_profile
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """`check LOG --profile P`."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="check")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="COMMAND")
     check_parser = actions.add_parser(
         "check",
         help="say what a profile makes of a log, and what looks wrong",
@@ -74,6 +74,6 @@ def _write(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise UsageError(
+        raise EqrtError(
             f"cannot write {path} ({error.strerror}); give --json a file that can be written"
         ) from error

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.can_check.chart import Marks, Panel, figure
 from eqrt.runtime.can_check.check import Checked
@@ -28,7 +28,7 @@ _TRACK_COLORS = ("blue", "orange", "green", "grey")
 
 
 def write_pictures(folder: Path, profile: Profile, checked: Checked) -> list[Path]:
-    """One SVG file for each; gives the paths. Raises UsageError if the folder cannot be written."""
+    """One SVG file for each; gives the paths. Raises EqrtError if the folder cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         written = []
@@ -37,7 +37,7 @@ def write_pictures(folder: Path, profile: Profile, checked: Checked) -> list[Pat
             path.write_text(text, encoding="utf-8")
             written.append(path)
     except OSError as error:
-        raise UsageError(
+        raise EqrtError(
             f"cannot write into {folder} ({error.strerror}); give --plot another folder"
         ) from error
     return written

@@ -97,6 +97,8 @@ class Sensor:
     name: str
     velocity: str
     """The kind, as the profile has it."""
+    mount: str
+    """Where the profile says that it sits, seen from the car's reference point."""
     cycles: Rhythm
     incomplete: int
     objects: int

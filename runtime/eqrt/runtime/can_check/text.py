@@ -93,6 +93,7 @@ def _sensor(sensor: Sensor) -> Iterator[str]:
         f"period {_duration(cycles.median_period_s)}, "
         f"worst gap {_duration(cycles.worst_gap_s)}"
     )
+    yield f"  mount {sensor.mount}, as the profile says; no recording can tell whether that is so"
     if not sensor.objects:
         return
     least, median, most = sensor.objects_per_cycle

@@ -41,6 +41,11 @@ class Profile:
         """Whether anything tells the ego vehicle's motion or pose."""
         return bool(self.ego)
 
+    def gives(self, what: str) -> bool:
+        """Whether a message tells that of the ego vehicle: a key of `[ego.fields]`, or `pose`."""
+        keys = {"x", "latitude"} if what == "pose" else {what}
+        return any(keys & set(ego.numbers) for ego in self.ego)
+
     @property
     def arbitration_ids(self) -> frozenset[int]:
         """Every id that the profile means, on any bus."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -104,3 +105,9 @@ class SensorProfile:
     object_id_offset: int
     mount: Pose2
     """`ego_from_sensor`."""
+
+    @property
+    def place(self) -> str:
+        """The mount in words."""
+        mount = self.mount
+        return f"x {mount.x_m:g} m, y {mount.y_m:g} m, yaw {math.degrees(mount.yaw_rad):g} degrees"

@@ -28,16 +28,28 @@ from eqrt.core.errors import EqrtError, UsageError
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.demo.picture import render
 from eqrt.runtime.demo.programs import eqrt, running
-from eqrt.runtime.demo.score import Scoreboard
+from eqrt.runtime.demo.score import VELOCITY_S, Scoreboard
 from eqrt.runtime.demo.snapshots import BestMoment
 from eqrt.runtime.demo.viewing import watched
 from eqrt.runtime.output.datagrams import Datagram, decode_datagram
-from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.prediction.tiles import load_tile
 
 DATA = Path(__file__).parent / "data"
 _START_S = 20.0  # a service that has not said that it runs by then never will
 _SILENT_S = 3.0  # after the player has ended
+
+
+_ABOUT_LINES = """\
+A line a second. Errors begin after 4 s, when what was predicted has happened: the mean distance
+between where eqrt said that a car would be and where it was, over all scored so far. Modes: RUN
+predicts with the map, NO_MAP without one; NO_POSE at first is normal (nothing has told yet how the
+car moves); LATE: this machine had too much else to do.
+"""
+_HEAD = (
+    f"  {'time':>6}  {'mode':8} {'':11}  {'compute':>8}   "
+    "in brackets: had everybody kept speed and course (constant velocity)"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +119,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--seconds is {args.seconds}; give a number above 0, 10 shows something")
     _make_folder(args.out)
     parts = [part for part in PARTS if args.part in (None, part.name)]
+    print(_ABOUT_LINES)
     with watched(args.view) as viewers:
         for index, part in enumerate(parts):
             print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
@@ -114,6 +127,7 @@ def run(args: argparse.Namespace) -> int:
             result.print_summary()
             picture = result.write_picture(args.out / f"eqrt-demo-{part.name}.svg")
             print(f"  picture    {picture if picture else 'none: nothing could be scored'}")
+    print("\nnext: with your own radar, docs/start-radar.md")
     return 0
 
 
@@ -138,6 +152,9 @@ class PartResult:
             print(f"  {label:18}" + "".join(f"{value:9.2f}" for value in table.values()))
         p50, p99 = 1e3 * np.quantile(self.latencies_s, [0.5, 0.99])
         print(f"  time to predict all objects of a cycle: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
+        if self.board.too_young:
+            print(f"  left out   {self.board.too_young} of tracks younger than {VELOCITY_S:g} s")
+        print(f"  verdict    {_verdict(ours['fde_3s'], baseline['fde_3s'])}")
 
     def write_picture(self, path: Path) -> Path | None:
         """One moment of the part as SVG, or None if none could be scored."""
@@ -158,6 +175,7 @@ def play_part(part: Part, seconds: float | None, viewers: Sequence[str] = ()) ->
         channel = f"eqrt-demo-{os.getpid()}"
         to = [address, *viewers]
         with _service(part, channel, to), _player(part, channel) as player:
+            print(_HEAD)
             started_s = time.monotonic()
             line_due_s = started_s + 1.0
             for forecast in _forecasts(receiver, player, seconds):
@@ -165,7 +183,18 @@ def play_part(part: Part, seconds: float | None, viewers: Sequence[str] = ()) ->
                 if time.monotonic() >= line_due_s:
                     print(_line(result, forecast, time.monotonic() - started_s), flush=True)
                     line_due_s += 1.0
+            if player.poll() is not None:
+                print("  (end of recording)", flush=True)
     return result
+
+
+def _verdict(ours_m: float, baseline_m: float) -> str:
+    difference = ours_m / baseline_m - 1.0
+    than = "nearer to" if difference < 0.0 else "farther from"
+    return (
+        f"after 3 s, eqrt is {abs(difference):.0%} {than} what happened than constant velocity: "
+        f"{ours_m:.2f} m instead of {baseline_m:.2f} m"
+    )
 
 
 def _make_folder(folder: Path) -> None:
@@ -175,7 +204,7 @@ def _make_folder(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise UsageError(
+        raise EqrtError(
             f"cannot write pictures to {folder.resolve()} ({error.strerror}); "
             "give --out a folder that can be written"
         ) from error
@@ -203,7 +232,7 @@ def _line(result: PartResult, forecast: ForecastSet, seconds: float) -> str:
 def _forecasts(
     receiver: socket.socket, player: subprocess.Popen[str], seconds: float | None
 ) -> Iterator[ForecastSet]:
-    """What the service says, until the player has ended and what it sent is answered.
+    """What the service says, until the player has ended and nothing more comes.
 
     `seconds` count from the first prediction, however long the processes take to start.
     """
@@ -216,6 +245,8 @@ def _forecasts(
             if not isinstance(heard, Datagram):
                 continue
             forecast = heard.forecasts
+            if forecast.mode is Mode.SILENT and player.poll() is not None:
+                return
             if seconds is not None and forecast.num_targets:
                 end_s = min(end_s, time.monotonic() + seconds)
             yield forecast

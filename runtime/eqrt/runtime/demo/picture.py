@@ -41,6 +41,8 @@ class Moment:
     """(2,) positions now."""
     ego: Float64 | None = None
     """(2,)"""
+    is_north_known: bool = True
+    """False = y is not north, but whatever it was where the dead reckoning began."""
 
     def drawn(self) -> list[Float64]:
         """Everything but the lanes, each (n, 2) or (2,)."""
@@ -165,7 +167,8 @@ def _legend(view: _View, moment: Moment) -> list[str]:
             f'<circle cx="{x + 8:.0f}" cy="46" r="7" fill="#009e73"/>'
             f'<text x="{x + 22:.0f}" y="51" font-size="14">ego</text>'
         )
-    return [*parts, *_north(view), *_scale_bar(view)]
+    north = _north(view) if moment.is_north_known else []
+    return [*parts, *north, *_scale_bar(view)]
 
 
 def _north(view: _View) -> list[str]:

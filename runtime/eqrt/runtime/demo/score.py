@@ -44,6 +44,9 @@ class Scoreboard:
 
     def __init__(self, keep: int | None = None) -> None:
         """`keep`: how many of the newest predictions `tables` speaks of; None = of all."""
+        self.too_young = 0
+        """Predictions that are left out although what happened is known: of tracks that were not
+        there VELOCITY_S before, for which constant velocity could not say anything."""
         self._places: dict[int, _Places] = {}
         self._pending: deque[ForecastSet] = deque()
         self._model: deque[Float64] = deque(maxlen=keep)
@@ -84,6 +87,7 @@ class Scoreboard:
                 continue
             before = places.at(np.array([anchor_s - VELOCITY_S]))
             if before is None:
+                self.too_young += 1
                 continue
             velocity = (forecast.position[row] - before[0]) / VELOCITY_S
             course = forecast.position[row] + velocity * ahead_s[:, None]

@@ -56,6 +56,7 @@ class BestMoment:
             moment.lines["history"].append(np.array(histories[s.track_id]))
             moment.agents.append(start[0])
         moment.ego = np.array([then.map_from_ego.x_m, then.map_from_ego.y_m])
+        moment.is_north_known = tile is not None and then.mode is not Mode.NO_POSE
         if tile is not None:
             moment.lanes = _lanes_near(tile, np.concatenate(moment.lines["truth"]))
         return moment

@@ -93,7 +93,7 @@ def examine(asked: argparse.Namespace, listen_s: float) -> Iterator[Finding]:
     profile, finding = check_profile(asked.profile)
     yield finding
     yield check_model(asked.model)
-    yield check_tile(asked.tile)
+    yield check_tile(asked.tile, profile)
     yield check_metrics(asked.metrics, asked.metrics_anywhere)
     yield check_datagrams(asked.datagrams)
     yield check_recording(asked)

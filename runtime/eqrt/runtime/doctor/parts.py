@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import median
 
 from eqrt.core.errors import EqrtError
+from eqrt.runtime.advice import unused_map
 from eqrt.runtime.decoding.profile import Profile, load_profile
 from eqrt.runtime.doctor.finding import Finding, fail, ok, warn
 from eqrt.runtime.operation.endpoint import Endpoint
@@ -35,9 +36,12 @@ def check_profile(name: str | None) -> tuple[Profile | None, Finding]:
         profile = load_profile(name)
     except EqrtError as error:
         return None, fail("profile", str(error))
-    sensors = ", ".join(sensor.name for sensor in profile.sensors) or "no sensor"
-    ids = len(profile.arbitration_ids)
-    return profile, ok("profile", f"{profile.name}: {sensors}; {ids} CAN ids")
+    count, ids = len(profile.sensors), len(profile.arbitration_ids)
+    gives = [f"{count or 'no'} sensor{'' if count == 1 else 's'}"]
+    for key in ("speed", "yaw_rate", "pose"):
+        words = key.replace("_", " ")
+        gives.append(words if profile.gives(key) else f"no {words}")
+    return profile, ok("profile", f"{profile.name}: {', '.join(gives)}; {ids} CAN ids")
 
 
 def check_model(folder: Path) -> Finding:
@@ -60,8 +64,8 @@ def check_model(folder: Path) -> Finding:
     return ok("model", found)
 
 
-def check_tile(path: Path | None) -> Finding:
-    """Whether it can be read, and what is in it."""
+def check_tile(path: Path | None, profile: Profile | None) -> Finding:
+    """Whether it can be read, what is in it, and whether the profile lets it be used."""
     if path is None:
         return ok("tile", "none: predictions will be made without a map")
     try:
@@ -71,7 +75,10 @@ def check_tile(path: Path | None) -> Finding:
     info = tile.info
     origin = info.origin_deg
     where = f"origin {origin[0]:.5f}, {origin[1]:.5f}" if origin else "origin not on Earth"
-    return ok("tile", f"{info.name} {info.tile_id}: {tile.lane_map.num_lanes} lanes, {where}")
+    found = f"{info.name} {info.tile_id}: {tile.lane_map.num_lanes} lanes, {where}"
+    if profile is not None and (advice := unused_map(profile, tile)):
+        return warn("tile", found, advice)
+    return ok("tile", found)
 
 
 def check_metrics(address: str | None, anywhere: bool) -> Finding:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TextIO
 
+from eqrt.runtime.advice import without_motion
 from eqrt.runtime.bus.health import LOST, BusWord
 from eqrt.runtime.operation.event_log import EventLog, Level
 from eqrt.runtime.operation.outlet import Outlet
@@ -88,7 +89,7 @@ class Changes:
         """Tell what is new."""
         before, self._before = self._before, status
         if status.mode != (before.mode if before else Mode.SILENT):
-            self._mode(Mode(status.mode))
+            self._mode(status)
         buses = {bus.channel: bus for bus in before.buses} if before else {}
         for bus in status.buses:
             self._bus(buses.get(bus.channel), bus)
@@ -101,11 +102,13 @@ class Changes:
                 text = counted.text.format(more)
                 self._log.say(counted.level, counted.event, text, count=more)
 
-    def _mode(self, mode: Mode) -> None:
+    def _mode(self, status: ServiceStatus) -> None:
+        mode = Mode(status.mode)
         level = Level.INFO if mode in _GOOD else Level.WARNING
-        self._log.say(
-            level, f"mode-{mode.name}", f"mode {mode.name}: {MODES[mode]}", mode=mode.name
-        )
+        text = f"mode {mode.name}: {MODES[mode]}"
+        if mode is Mode.NO_POSE:
+            text = f"mode {mode.name}: {_lacks(status)}"
+        self._log.say(level, f"mode-{mode.name}", text, mode=mode.name)
 
     def _bus(self, before: BusStatus | None, bus: BusStatus) -> None:
         state_before = before.state if before else "UP"
@@ -128,3 +131,10 @@ class Changes:
         self._log.say(
             level, f"source-{source.name}", f"source {source.name} {state}", source=source.name
         )
+
+
+def _lacks(status: ServiceStatus) -> str:
+    """What NO_POSE is about, and what to do: with objects the motion is known, the place is not."""
+    if status.tile and status.objects:
+        return "nothing says where on the map the car is: docs/radar-ins-map.md"
+    return without_motion(one.name for one in status.sources if not one.valid)

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eqrt.core.errors import LogError, UsageError
+from eqrt.core.errors import EqrtError, LogError, UsageError
 from eqrt.training.recordings.recording import Source
 from eqrt.training.simulation.drivers import STEP_S
 from eqrt.training.simulation.run import OBSERVERS, Run, Tally, simulate
@@ -154,7 +154,7 @@ def _new_folder(path: Path) -> Iterator[Path]:
             path.rmdir()
         part.rename(path)
     except OSError as error:
-        raise UsageError(f"cannot write {path} ({error.strerror}); give another --out") from error
+        raise EqrtError(f"cannot write {path} ({error.strerror}); give another --out") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.runtime.advice import never_came, without_motion
 from eqrt.runtime.bench.environment import read_environment
 from eqrt.runtime.bench.model import Say, identity, load_noticed
 from eqrt.runtime.bench.options import artifact_of
@@ -22,10 +23,11 @@ from eqrt.runtime.bench.table import case_lines, closing_lines, heading_lines
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.decoding.can_io import Decoder
-from eqrt.runtime.decoding.detections import Detections
+from eqrt.runtime.decoding.detections import EgoMotion, EgoPose
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.signals import until_told_to_stop
+from eqrt.runtime.tracking.ego import EgoTracker
 
 
 def setup_of(args: argparse.Namespace, before: Sequence[int], cores: Sequence[int]) -> Setup:
@@ -77,17 +79,26 @@ def _of_log(args: argparse.Namespace, setup: Setup) -> Setup:
     )
 
 
-def objects_in(log: Path, profile: str) -> int:
-    """The median number of objects in a cycle of a log, at least 1. Raises EqrtError if none."""
-    decoder = Decoder(load_profile(profile))
-    counts = [
-        len(event.object_id)
-        for message in read_log(log)
-        for event in decoder.feed(message, message.timestamp)
-        if isinstance(event, Detections)
-    ]
+def objects_in(log: Path, profile: str, *, stationary: bool = False) -> int:
+    """The median number of objects in a cycle of a log, at least 1. Raises EqrtError if there is
+    no cycle, or nothing tells how the car moves at any of them: then nothing would be predicted.
+    """
+    known = load_profile(profile)
+    decoder, ego = Decoder(known), EgoTracker(stationary=stationary or not known.has_ego)
+    counts, is_placed = [], False
+    for message in read_log(log):
+        for event in decoder.feed(message, message.timestamp):
+            if isinstance(event, EgoMotion):
+                ego.motion(event)
+            elif isinstance(event, EgoPose):
+                ego.pose(event)
+            else:
+                counts.append(len(event.object_id))
+                is_placed = is_placed or ego.at(event.timestamp_s) is not None
     if not counts:
         raise EqrtError(f"{log}: no object cycle of the profile {profile} in it")
+    if not is_placed:
+        raise EqrtError(f"{log}: no prediction, NO_POSE: {without_motion(never_came(decoder))}")
     return max(1, round(float(np.median(counts))))
 
 
@@ -100,7 +111,8 @@ def bench_service(setup: Setup, settings: Settings, say: Say) -> Report:
     environment = read_environment()
     model = identity(load_noticed(setup.model, settings.threads))
     if setup.log is not None:
-        settings = replace(settings, targets=(objects_in(setup.log, setup.profile),))
+        objects = objects_in(setup.log, setup.profile, stationary=setup.stationary)
+        settings = replace(settings, targets=(objects,))
     settings = replace(settings, bus=_named(setup.bus))
     cases: list[Case] = []
     with until_told_to_stop() as should_stop:

@@ -20,6 +20,11 @@ from eqrt.runtime.bench.service.orders import ServiceOrder, TrafficOrder, writte
 PATIENCE_S = 60.0
 """For what a process should do at once, on a machine that is busy."""
 _LOOK_S = 0.2  # how often it is asked whether to stop
+_NOTHING = {
+    "first": "no prediction",
+    "measuring": "too few predictions",
+}
+"""What it means that a service does not say this."""
 _PACKAGE = "eqrt.runtime.bench.service"
 
 
@@ -58,7 +63,8 @@ class Program:
             return None
         self._errors.seek(0)
         errors = self._errors.read().strip().splitlines()
-        said = errors[-1] if errors else f"no word of {event!r} in {patience_s:.0f} s"
+        nothing = _NOTHING.get(event, f"no word of {event!r}")
+        said = errors[-1] if errors else f"{nothing} within {patience_s:.0f} s"
         raise EqrtError(f"the process of the {self._name} failed: {said}")
 
     def cpu_s(self) -> float:
