@@ -229,6 +229,22 @@ def test_what_is_not_known_is_marked_not_available(fd: Wire) -> None:
     assert car["X10"] == pytest.approx(40.0)
 
 
+@pytest.mark.parametrize("mode", [Mode.LATE, Mode.FALLBACK])
+def test_physics_without_a_velocity_gives_no_points(fd: Wire, classic: Wire, mode: Mode) -> None:
+    """It would be sent as standing; where it is, is known. The model needs no velocity."""
+    unknown = replace(one_car(), velocity=np.full((1, 2), np.nan))
+    by_physics = replace(unknown, agent_mode=np.array([mode], np.uint8))
+    _, (_, car) = fd.decoded(by_physics)
+    assert {car[f"{axis}{i}"] for axis in "XY" for i in range(1, 11)} == {NOT_AVAILABLE}
+    assert car["PositionX"] == pytest.approx(20.0)
+    points = [values for name, values in classic.decoded(by_physics) if "Point" in name]
+    assert {point[axis] for point in points for axis in "XY"} == {NOT_AVAILABLE}
+    _, (_, car) = fd.decoded(unknown)
+    assert car["X10"] == pytest.approx(50.0)
+    _, (_, car) = fd.decoded(replace(one_car(), agent_mode=by_physics.agent_mode))
+    assert car["X10"] == pytest.approx(50.0)
+
+
 def test_points_beyond_the_horizon_are_not_available(fd: Wire, classic: Wire) -> None:
     """Half a second of forecast fills five points of 0.1 s, and no whole second."""
     forecasts = one_car()

@@ -82,6 +82,16 @@ def test_a_heading_is_measured_or_where_it_drives_to_or_not_known() -> None:
     np.testing.assert_allclose(course_rad(forecast), [0.5, -math.pi / 2, np.nan])
 
 
+def test_what_only_seems_to_stand_is_not_said_to_be_predicted() -> None:
+    unknown = replace(one_car(), velocity=np.full((1, 2), np.nan))
+    late = replace(unknown, agent_mode=np.array([Mode.LATE], np.uint8))
+    agents = decode_update(update_of(late))[0]["agents"]
+    assert agents["words"] == ["not predicted: nothing tells how it moves"]
+    assert agents["speed_mps"] == [None]
+    agents = decode_update(update_of(unknown))[0]["agents"]
+    assert agents["words"] == ["by the model, from a short history"]
+
+
 def test_an_ellipse_holds_half_of_the_distribution() -> None:
     forecast = one_car()
     along, across = 3.0, 0.75

@@ -222,6 +222,7 @@ class Pipeline:
             targets.valid,
             dt_s,
             object_class=targets.object_class,
+            measured=targets.velocity,
             covariances=raw.covariances,
         )
         made_s = self._time(moment.now_s)

@@ -191,7 +191,7 @@ def _trajectories(forecasts: ForecastSet, num_modes: int, stride: int) -> Rows:
     rows["velocity"] = _signed(velocity, _VELOCITY_MPS, 16)
     rows["point_step"] = _unsigned(stride * forecasts.dt_s, _AGE_S, 16)
     rows["points"] = _signed(math.nan, _POSITION_M, 16)  # those beyond the horizon stay so
-    rows["points"][:, :, : points.shape[2]] = _signed(ego_from_map.apply(points), _POSITION_M, 16)
+    rows["points"][:, :, : points.shape[2]] = _signed(_in_ego(points, forecasts), _POSITION_M, 16)
     return rows.ravel()
 
 
@@ -235,9 +235,17 @@ def _points_classic(forecasts: ForecastSet) -> Rows:
     rows["point"] = _signed(math.nan, _POSITION_M, 16)
     known = (steps >= 0) & (steps < horizon)
     points = forecasts.trajectories[objects, 0][:, steps[known]]
-    points = forecasts.map_from_ego.inverse().apply(points)
-    rows["point"][:, known] = _signed(points, _POSITION_M, 16)
+    rows["point"][:, known] = _signed(_in_ego(points, forecasts), _POSITION_M, 16)
     return rows.ravel()
+
+
+def _in_ego(points: NDArray[np.float64], forecasts: ForecastSet) -> NDArray[np.float64]:
+    """Points (A, ..., 2) of the first A trajectories, map frame, as seen from the ego vehicle; NaN
+    where these say nothing.
+    """
+    moved = forecasts.map_from_ego.inverse().apply(points)
+    moved[forecasts.is_standstill_assumed[: len(points)]] = np.nan
+    return moved
 
 
 def short_id(text: str) -> int:
