@@ -268,6 +268,7 @@ def test_without_ego_motion_nothing_is_predicted_unless_the_sensor_stands_still(
     alone = [m for m in traffic(CARS, 0.5) if m.arbitration_id != 0x5A0]
     forecasts = feed(pipeline_of(), alone)
     assert {(f.mode, f.num_targets) for f in forecasts} == {(Mode.NO_POSE, 0)}
+    assert {f.map_from_ego for f in forecasts} == {None}
     profile = load_profile("generic")
     standing = feed(Pipeline(profile, shipped_predictor(), stationary=True), alone)
     assert {(f.mode, f.num_targets) for f in standing} == {(Mode.NO_MAP, 3)}

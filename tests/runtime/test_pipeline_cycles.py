@@ -182,7 +182,7 @@ def test_silence_says_nothing_but_how_long_it_has_lasted(profile: Profile) -> No
     (silent,) = road.pipeline.poll(11.0)
     assert (silent.mode, silent.num_targets, silent.cycle) == (Mode.SILENT, 0, 1)
     assert (silent.timestamp_s, silent.made_s, silent.compute_s) == (10.0, 11.0, 0.0)
-    assert silent.map_from_ego == Pose2()
+    assert silent.map_from_ego is None
     assert np.isnan(silent.ego_speed_mps)
     assert silent.trajectories.shape == (0, CONTRACT.num_modes, CONTRACT.horizon_steps, 2)
 
@@ -319,6 +319,7 @@ def test_a_forecast_says_what_is_known_of_its_targets_and_of_the_ego_vehicle() -
     assert (forecast.cycle, forecast.timestamp_s, forecast.dt_s) == (3, 100.375, DT_S)
     assert (forecast.model_id, forecast.tile_id) == ("steady", "")
     assert forecast.ego_speed_mps == pytest.approx(3.0)
+    assert forecast.map_from_ego is not None
     assert forecast.map_from_ego.x_m == pytest.approx(3.0 * 0.375)
     assert forecast.object_id.tolist() == [7, 3]
     assert forecast.track_id.tolist() == [1, 2]

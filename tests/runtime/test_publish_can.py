@@ -165,6 +165,7 @@ def test_a_car_ahead_reads_as_such_on_classic_can(classic: Wire) -> None:
 
 def test_every_object_is_decoded_to_within_half_a_step(fd: Wire) -> None:
     forecasts = many(32)
+    assert forecasts.map_from_ego is not None
     ego_from_map = forecasts.map_from_ego.inverse()
     expected = ego_from_map.apply(forecasts.trajectories[:, 0, 2::3])
     _, *decoded = fd.decoded(forecasts)
@@ -255,6 +256,19 @@ def test_points_beyond_the_horizon_are_not_available(fd: Wire, classic: Wire) ->
     assert {car[f"{axis}{i}"] for axis in "XY" for i in range(6, 11)} == {NOT_AVAILABLE}
     points = [values["X"] for name, values in classic.decoded(forecasts) if "Point" in name]
     assert points == [NOT_AVAILABLE] * 3
+
+
+def test_where_the_ego_vehicle_is_not_known_so_is_all_that_is_seen_from_it(
+    fd: Wire, classic: Wire
+) -> None:
+    """Its pose, and whatever somebody wants to be sent from there."""
+    (_, status), (_, car) = fd.decoded(replace(one_car(), map_from_ego=None))
+    assert {status[name] for name in ("EgoX", "EgoY", "EgoYaw")} == {NOT_AVAILABLE}
+    places = {f"{name}{axis}" for name in ("Position", "Velocity") for axis in "XY"}
+    places |= {f"{axis}{i}" for i in range(1, 11) for axis in "XY"}
+    assert {car[place] for place in places} == {NOT_AVAILABLE}
+    points = [v for name, v in classic.decoded(replace(one_car(), map_from_ego=None)) if "X" in v]
+    assert [point["X"] for point in points] == [NOT_AVAILABLE] * 3
 
 
 def test_old_input_is_as_old_as_can_be_said(fd: Wire) -> None:

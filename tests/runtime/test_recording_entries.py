@@ -46,6 +46,7 @@ def test_every_kind_of_message_comes_back_as_it_was(message: can.Message) -> Non
 FORECASTS = {
     "one": one_car(),
     "nobody": nobody(),
+    "nowhere": replace(nobody(), map_from_ego=None),
     "many": many(70),
     "covariances": replace(many(3), covariances=np.random.default_rng(0).random((3, 6, 30, 2, 2))),
 }

@@ -67,10 +67,12 @@ def test_what_lies_too_far_out_is_no_place_rather_than_a_wrong_one() -> None:
 
 
 def test_a_cycle_without_an_ego_pose_tells_none() -> None:
-    silent = replace(nobody(), map_from_ego=Pose2(), ego_speed_mps=math.nan)
-    head, _ = decode_update(update_of(silent))
-    assert head["ego"] is None
-    assert head["level"] == "bad"
+    """Nor does one from a recording of before there was None."""
+    for nowhere in (None, Pose2()):
+        silent = replace(nobody(), map_from_ego=nowhere, ego_speed_mps=math.nan)
+        head, _ = decode_update(update_of(silent))
+        assert head["ego"] is None
+        assert head["level"] == "bad"
     standing = replace(one_car(), ego_speed_mps=0.0)
     assert decode_update(update_of(standing))[0]["ego"] == pytest.approx([100, 200, math.pi / 2])
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import can
 import numpy as np
 
-from eqrt.core.frames import Pose2
 from eqrt.core.lane_choice import centerline_source
 from eqrt.core.scene import CenterlineSource
 from eqrt.runtime.decoding.can_io import Decoder, Event
@@ -242,7 +241,7 @@ class Pipeline:
             mode=mode,
             model_id=self.predictor.model_id,
             tile_id=used_tile.info.tile_id if used_tile else "",
-            map_from_ego=ego.map_from_ego if ego else Pose2(),
+            map_from_ego=ego.map_from_ego if ego else None,
             ego_speed_mps=ego.velocity[0] if ego else np.nan,
             dt_s=dt_s,
             track_id=targets.track_id,

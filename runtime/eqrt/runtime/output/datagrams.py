@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import UsageError, in_one_line
-from eqrt.core.frames import Pose2
-from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.forecasts import ForecastSet, Mode, pose_numbers, pose_of
 from eqrt.runtime.output.status import ServiceStatus
 
 FORMAT_VERSION = 2
@@ -151,7 +150,7 @@ class _Wire(msgspec.Struct, tag_field="kind", tag="forecast"):
     mode: int
     model_id: str
     tile_id: str
-    map_from_ego: tuple[float, float, float]  # x m, y m, yaw rad
+    map_from_ego: tuple[float, float, float]  # x m, y m, yaw rad; NaN = not known
     origin: tuple[float, float]  # m, map frame: positions count from here
     ego_speed_mps: float
     dt_s: float
@@ -179,7 +178,8 @@ _DECODER = msgspec.msgpack.Decoder(_Wire | _StatusWire)
 
 def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
     pose = forecasts.map_from_ego
-    origin = (pose.x_m, pose.y_m)  # float32 is exact to 0.1 mm around the ego vehicle
+    # float32 is exact to 0.1 mm around the ego vehicle; where that is not known, nothing is sent
+    origin = (pose.x_m, pose.y_m) if pose is not None else (0.0, 0.0)
     some = forecasts.targets(rows)
     return _Wire(
         version=FORMAT_VERSION,
@@ -192,7 +192,7 @@ def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
         mode=int(some.mode),
         model_id=some.model_id,
         tile_id=some.tile_id,
-        map_from_ego=(pose.x_m, pose.y_m, pose.yaw_rad),
+        map_from_ego=pose_numbers(pose),
         origin=origin,
         ego_speed_mps=some.ego_speed_mps,
         dt_s=some.dt_s,
@@ -231,7 +231,7 @@ def _forecasts(wire: _Wire) -> ForecastSet:
         mode=Mode(wire.mode),
         model_id=wire.model_id,
         tile_id=wire.tile_id,
-        map_from_ego=Pose2(*wire.map_from_ego),
+        map_from_ego=pose_of(wire.map_from_ego),
         ego_speed_mps=wire.ego_speed_mps,
         dt_s=wire.dt_s,
         track_id=np.frombuffer(wire.track_id, "<i8").reshape(agents),

@@ -7,6 +7,7 @@ Map frame, metres, seconds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -60,7 +61,8 @@ class ForecastSet:
     """The first digits of the model file's sha256, hexadecimal; empty without a model."""
     tile_id: str
     """Likewise of the tile; empty without a map."""
-    map_from_ego: Pose2
+    map_from_ego: Pose2 | None
+    """None = not known: then nothing is predicted."""
     ego_speed_mps: float
     """Of the ego reference point over ground, backwards negative; NaN = not known."""
     dt_s: float
@@ -121,6 +123,16 @@ class ForecastSet:
         chosen = {name: getattr(self, name)[rows] for name in _OF_TARGETS}
         covariances = None if self.covariances is None else self.covariances[rows]
         return replace(self, covariances=covariances, **chosen)
+
+
+def pose_numbers(pose: Pose2 | None) -> tuple[float, float, float]:
+    """A pose as formats have it: x and y in m, yaw in rad, all NaN = not known."""
+    return (pose.x_m, pose.y_m, pose.yaw_rad) if pose is not None else (math.nan,) * 3
+
+
+def pose_of(numbers: tuple[float, float, float]) -> Pose2 | None:
+    """The pose that `pose_numbers` wrote."""
+    return None if any(map(math.isnan, numbers)) else Pose2(*numbers)
 
 
 _OF_TARGETS = (

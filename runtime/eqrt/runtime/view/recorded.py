@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import LogError, in_one_line
-from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import Line
@@ -106,7 +105,7 @@ def _forecast(
             mode=Mode[first.cycle_mode],
             model_id=first.model_id,
             tile_id=first.tile_id,
-            map_from_ego=Pose2(),
+            map_from_ego=None,
             ego_speed_mps=math.nan,
             dt_s=first.dt_s,
             track_id=np.array([line.track_id for line in lines]),

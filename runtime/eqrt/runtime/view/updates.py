@@ -229,10 +229,14 @@ def is_on_map(forecast: ForecastSet) -> bool:
 
 
 def ego_pose(forecast: ForecastSet) -> tuple[float, float, float] | None:
-    """x, y in m and yaw in rad in the map frame; a cycle that knows no speed knows no pose."""
+    """x, y in m and yaw in rad in the map frame; None = not known.
+
+    Older recordings have a pose of zeros there, but no speed.
+    """
     pose = forecast.map_from_ego
-    known = not math.isnan(forecast.ego_speed_mps)
-    return (pose.x_m, pose.y_m, pose.yaw_rad) if known else None
+    if pose is None or math.isnan(forecast.ego_speed_mps):
+        return None
+    return pose.x_m, pose.y_m, pose.yaw_rad
 
 
 def _agents(forecast: ForecastSet, ghosts: Ghosts) -> Agents:
