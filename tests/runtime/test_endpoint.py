@@ -161,7 +161,7 @@ def test_a_service_without_ego_motion_is_not_well_one_without_a_place_in_the_map
     for message in cycle([Car(object_id=1, x_m=5.0, y_m=0.0)], 0.0):
         if ego_moves or message.arbitration_id != EGO_MOTION:
             for forecast in pipeline.feed(message, 0.0):
-                book.published(forecast, time.monotonic())
+                book.published(forecast)
     now_s = time.monotonic() + 1.0
     is_well, told = health(book.close(now_s), now_s)
     reason = "" if ego_moves else "no ego motion: nothing is predicted"

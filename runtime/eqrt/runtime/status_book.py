@@ -54,15 +54,15 @@ class StatusBook:
         """A message came."""
         self._messages += 1
 
-    def published(self, forecast: ForecastSet, arrived_s: float) -> None:
-        """A cycle, whose last message came at `arrived_s`, has been sent."""
+    def published(self, forecast: ForecastSet) -> None:
+        """A cycle has been sent."""
         now_s = time.monotonic()
         if forecast.mode != self._mode:
             self._mode, self._mode_since_s = forecast.mode, now_s
         self._objects = forecast.num_targets
         self._ego_known = forecast.map_from_ego is not None
         if forecast.num_targets:
-            self._latencies_s.append(now_s - arrived_s)
+            self._latencies_s.append(now_s - forecast.received_s)
 
     def close(self, now_s: float) -> ServiceStatus:
         """What the period was; the next one begins at `now_s` (monotonic clock)."""

@@ -8,6 +8,7 @@ closed port costs the same and fails nothing.
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -170,6 +171,7 @@ class _Wire(msgspec.Struct, tag_field="kind", tag="forecast"):
     trajectories: bytes  # float32 (A, K, H, 2)
     probabilities: bytes  # float32 (A, K)
     covariances: bytes  # float32 (A, K, H, 2, 2), or empty
+    received_s: float = math.nan  # an older service does not tell
 
 
 _ENCODER = msgspec.msgpack.Encoder()
@@ -212,6 +214,7 @@ def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
         trajectories=_bytes(some.trajectories - origin),
         probabilities=_bytes(some.probabilities),
         covariances=b"" if some.covariances is None else _bytes(some.covariances),
+        received_s=some.received_s,
     )
 
 
@@ -226,6 +229,7 @@ def _forecasts(wire: _Wire) -> ForecastSet:
     return ForecastSet(
         cycle=wire.cycle,
         timestamp_s=wire.timestamp_s,
+        received_s=wire.received_s,
         made_s=wire.made_s,
         compute_s=wire.compute_s,
         mode=Mode(wire.mode),

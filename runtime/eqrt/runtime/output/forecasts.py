@@ -34,7 +34,7 @@ class Mode(IntEnum):
     PARTIAL = 3
     """The target has been seen for less than the model's history."""
     LATE = 4
-    """Of a cycle: out later than one period after its input, or some of its targets are late.
+    """Of a cycle: made later than one period after `received_s`, or some of its targets are late.
 
     Of a target: there was no time for the model; constant turn rate and velocity instead.
     """
@@ -52,6 +52,8 @@ class ForecastSet:
     """Counts the cycles from 0, also those without targets."""
     timestamp_s: float
     """The newest measurement used; `map_from_ego` holds at this time."""
+    received_s: float
+    """When the cycle's last message came; NaN = nothing came (SILENT), or it is not told."""
     made_s: float
     """When the prediction was finished."""
     compute_s: float

@@ -7,6 +7,7 @@ recording must tell whether a replay came out the same.
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from typing import Annotated, Any
 
@@ -52,6 +53,8 @@ class _Wire(msgspec.Struct):
     trajectories: _Array
     probabilities: _Array
     covariances: _Array | None = None
+    received_s: float = math.nan
+    """Older recordings do not tell."""
 
 
 MAX_VALUE = 1e12

@@ -100,6 +100,7 @@ def _forecast(
         return ForecastSet(
             cycle=first.cycle,
             timestamp_s=first.time_s,
+            received_s=math.nan,
             made_s=first.time_s,
             compute_s=0.0,
             mode=Mode[first.cycle_mode],
