@@ -58,6 +58,7 @@ def crowd(cycle: int, agents: int = 64, *, start_s: float = 0.0) -> ForecastSet:
     return ForecastSet(
         cycle=cycle,
         timestamp_s=start_s + time_s,
+        received_s=start_s + time_s + 0.003,
         made_s=start_s + time_s + 0.011,
         compute_s=0.008,
         mode=Mode.NO_MAP,

@@ -27,6 +27,7 @@ def one_car() -> ForecastSet:
     return ForecastSet(
         cycle=300,
         timestamp_s=1000.0,
+        received_s=1000.003,
         made_s=1000.012,
         compute_s=0.0081,
         mode=Mode.NO_MAP,
@@ -67,6 +68,7 @@ def many(count: int, num_modes: int = 6, horizon: int = H, seed: int = 0) -> For
     return ForecastSet(
         cycle=7,
         timestamp_s=50.0,
+        received_s=50.0005,
         made_s=50.009,
         compute_s=0.0085,
         mode=Mode.RUN,

@@ -25,6 +25,7 @@ def driving(
             track_id=np.arange(targets),
             object_id=np.arange(targets),
             anchor_s=np.zeros(targets),
+            velocity=np.full((targets, 2), np.nan),
             heading_rad=unknown,
             object_class=np.full(targets, kind, np.uint8),
             length_m=unknown,

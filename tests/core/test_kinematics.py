@@ -62,12 +62,28 @@ def test_the_motion_of_a_circle_is_found(rate: float) -> None:
     np.testing.assert_allclose(np.linalg.norm(found), 12.0, rtol=0.01)
 
 
-def test_standing_and_short_histories_do_not_turn() -> None:
+def test_what_stands_has_no_velocity_and_what_was_seen_once_has_none_that_is_known() -> None:
+    """Neither turns."""
     valid = np.zeros((2, 20), np.bool_)
     valid[0, -1] = True
     valid[1] = True
     history = np.full((2, 20, 2), np.nan)
     history[valid] = 5.0
     velocity, turn_rate = fit_motion(history, valid, DT_S)
-    np.testing.assert_allclose(velocity, 0.0, atol=1e-12)
+    assert np.isnan(velocity[0]).all()
+    np.testing.assert_allclose(velocity[1], 0.0, atol=1e-12)
     np.testing.assert_array_equal(turn_rate, 0.0)
+
+
+def test_two_steps_make_a_velocity() -> None:
+    valid = np.zeros((1, 20), np.bool_)
+    valid[0, -2:] = True
+    velocity, turn_rate = fit_motion(straight(), valid, DT_S)
+    np.testing.assert_allclose(velocity, [[10.0, -2.0]])
+    np.testing.assert_array_equal(turn_rate, 0.0)
+
+
+def test_what_moves_at_an_unknown_velocity_stays_where_it_is() -> None:
+    unknown = np.full((1, 2), np.nan)
+    ahead = constant_turn(np.array([[3.0, 4.0]]), unknown, np.zeros(1), 5, DT_S)
+    np.testing.assert_array_equal(ahead, np.tile([3.0, 4.0], (1, 5, 1)))

@@ -100,6 +100,7 @@ def test_a_radar_beside_an_ins_is_predicted_on_the_map(radar_and_ins: Path, tmp_
     last = [forecast for forecast in made if forecast.num_targets][-1]
     assert last.mode is Mode.RUN
     assert last.tile_id == tile.info.tile_id
+    assert last.map_from_ego is not None
     assert (last.map_from_ego.x_m, last.map_from_ego.y_m) == pytest.approx((X_M, Y_M), abs=3.0)
     mounted = Pose2(3.6, 0.0, 0.0)
     assert profile.sensors[0].mount == mounted

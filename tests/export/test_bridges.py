@@ -43,7 +43,7 @@ from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, TapedClock
 from eqrt.runtime.status_book import StatusBook
-from forecast_sets import one_car
+from forecast_sets import nobody, one_car
 from plotjuggler import curves, plotjuggler_server, series
 from processes import PATIENCE_S, Serving, playing
 from source_tree import ROOT
@@ -70,21 +70,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     assert NGSIM.tile is not None
     tile = load_tile(NGSIM.tile)
     pipeline = Pipeline(load_profile("generic"), shipped_predictor(), tile, clock=clock)
-    order = Order(
-        folder=str(folder),
-        run="00c0ffee",
-        description=Description(
-            identity=identity_of(pipeline, model_folder=Path(), channels=None, stationary=False),
-            attached=attached_files("generic", pipeline),
-        ),
-        schemas={"/eqrt/status": json_schema(ServiceStatus), "/eqrt/lost": json_schema(Lost)},
-        file_bytes=1 << 30,
-        file_seconds=600.0,
-        total_bytes=1 << 40,
-        free_bytes=0,
-        delete_oldest=False,
-    )
-    with Recorder(order, clock, RunTape()) as recorder:
+    with Recorder(order_of(folder, pipeline), clock, RunTape()) as recorder:
         book = StatusBook(pipeline, Nowhere(), [recorder])
         for line in first_seconds(NGSIM.log, 2.0).splitlines():
             message = candump_message(line)
@@ -98,6 +84,23 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return found
 
 
+def order_of(folder: Path, pipeline: Pipeline) -> Order:
+    return Order(
+        folder=str(folder),
+        run="00c0ffee",
+        description=Description(
+            identity=identity_of(pipeline, model_folder=Path(), channels=None, stationary=False),
+            attached=attached_files("generic", pipeline),
+        ),
+        schemas={"/eqrt/status": json_schema(ServiceStatus), "/eqrt/lost": json_schema(Lost)},
+        file_bytes=1 << 30,
+        file_seconds=600.0,
+        total_bytes=1 << 40,
+        free_bytes=0,
+        delete_oldest=False,
+    )
+
+
 def convert(recording: Recording, kind: str, out: Path) -> None:
     assert main(["convert", str(recording.paths[0]), "--to", kind, "--out", str(out)]) == 0
 
@@ -109,8 +112,11 @@ def convert(recording: Recording, kind: str, out: Path) -> None:
 def shown(
     recording: Recording, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, list[tuple[int, bytes]]]:
+    return shown_of(recording, tmp_path_factory.mktemp("foxglove") / "drive.mcap")
+
+
+def shown_of(recording: Recording, file: Path) -> dict[str, list[tuple[int, bytes]]]:
     """Topic -> time and content of its messages, as mcap's indexed reader finds them."""
-    file = tmp_path_factory.mktemp("foxglove") / "drive.mcap"
     convert(recording, "foxglove", file)
     found: dict[str, list[tuple[int, bytes]]] = {}
     with file.open("rb") as stream:
@@ -157,9 +163,26 @@ def test_foxglove_knows_where_the_ego_vehicle_is(
     last = list(recording.forecasts())[-1]
     transform = FrameTransform.FromString(shown["/tf"][-1][1])
     assert (transform.parent_frame_id, transform.child_frame_id) == ("map", "ego")
+    assert last.map_from_ego is not None
     assert transform.translation.x == last.map_from_ego.x_m
     yaw_rad = 2.0 * math.atan2(transform.rotation.z, transform.rotation.w)
     assert math.cos(yaw_rad - last.map_from_ego.yaw_rad) == pytest.approx(1.0)
+
+
+def test_foxglove_is_told_no_place_of_an_ego_vehicle_whose_place_is_not_known(
+    tmp_path: Path,
+) -> None:
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor())
+    with Recorder(order_of(tmp_path, pipeline), TapedClock(lambda: 0.0), RunTape()) as recorder:
+        recorder.publish(one_car())
+        recorder.publish(replace(nobody(), map_from_ego=None, ego_speed_mps=math.nan))
+    (recording,) = read_recordings(tmp_path)
+    found = shown_of(recording, tmp_path / "drive.mcap")
+    known, unknown = (json.loads(content) for _, content in found["/cycle"])
+    ego = ("ego_x", "ego_y", "ego_yaw", "ego_speed")
+    assert [known[name] for name in ego] == pytest.approx([100.0, 200.0, math.pi / 2, 8.0])
+    assert [unknown[name] for name in ego] == [None] * 4
+    assert len(found["/tf"]) == 1
 
 
 def test_foxglove_has_lanes_numbers_and_a_log(

@@ -149,6 +149,7 @@ def test_a_large_cycle_is_split_by_tracks_each_with_its_time() -> None:
     ranges = {name: v for one in datagrams for name, v in one.items() if name.endswith("/range")}
     assert set(ranges) == {f"/track_{number}/range" for number in forecasts.track_id}
     ego = forecasts.map_from_ego
+    assert ego is not None
     far = np.linalg.norm(forecasts.position - (ego.x_m, ego.y_m), axis=-1)
     np.testing.assert_allclose(list(ranges.values()), far)
 

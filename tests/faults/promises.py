@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from eqrt.core.kinematics import FIT_STEPS
 from eqrt.runtime.decoding.latency_checks import MAX_INPUT_AGE_S
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import SILENT_PERIODS, TARGET_AGE_S
@@ -51,8 +52,11 @@ def sound(forecast: ForecastSet) -> None:
     """Finite, ids unique, probabilities sorted, nothing stale, nothing out of this world."""
     assert len(set(forecast.track_id.tolist())) == forecast.num_targets
     assert set(forecast.agent_mode.tolist()) <= AGENT_MODES
-    for values in (forecast.position, forecast.velocity, forecast.trajectories):
+    for values in (forecast.position, forecast.trajectories):
         assert np.isfinite(values).all()
+    assert not np.isinf(forecast.velocity).any()
+    seen_more = forecast.history_valid[:, -FIT_STEPS:].sum(axis=1) > 1
+    assert np.isfinite(forecast.velocity[seen_more]).all()
     assert (np.diff(forecast.probabilities, axis=1) <= 0.0).all()
     np.testing.assert_allclose(forecast.probabilities.sum(axis=1), 1.0, atol=1e-3)
     assert (forecast.age_s >= -1e-6).all()

@@ -18,8 +18,8 @@ def test_faults_on_messages_and_in_the_model_are_survived() -> None:
 
 TOLD = {
     "the sensor falls silent for 3 s": "SILENT",
-    "the model hangs for 1 s": "FALLBACK",
-    "the model hangs for good": "FALLBACK",
+    "the model hangs for 1 s": "LATE",
+    "the model hangs for good": "LATE",
 }
 """What consumers must be told meanwhile."""
 

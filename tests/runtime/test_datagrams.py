@@ -67,8 +67,8 @@ def uncertain() -> ForecastSet:
 
 @pytest.mark.parametrize(
     "forecasts",
-    [one_car(), many(30), nobody(), uncertain()],
-    ids=["one", "30", "none", "uncertain"],
+    [one_car(), many(30), nobody(), replace(nobody(), map_from_ego=None), uncertain()],
+    ids=["one", "30", "none", "nowhere", "uncertain"],
 )
 def test_what_is_sent_arrives(forecasts: ForecastSet, listener: socket.socket) -> None:
     with DatagramPublisher([address_of(listener)]) as publisher:
@@ -82,8 +82,9 @@ def test_what_is_sent_arrives(forecasts: ForecastSet, listener: socket.socket) -
 def test_far_from_the_origin_of_the_map_millimetres_are_kept(listener: socket.socket) -> None:
     """5,000 km away, where float32 would be off by 0.25 m."""
     near, away = many(8), np.array([3e6, 4e6])
-    ego = replace(near.map_from_ego, x_m=near.map_from_ego.x_m + 3e6)
-    ego = replace(ego, y_m=ego.y_m + 4e6)
+    here = near.map_from_ego
+    assert here is not None
+    ego = replace(here, x_m=here.x_m + 3e6, y_m=here.y_m + 4e6)
     far = replace(
         near,
         map_from_ego=ego,

@@ -16,7 +16,7 @@ import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from drives import Car, cycle, shipped_predictor
+from drives import TILE, Car, cycle, shipped_predictor
 from eqrt.core.errors import AddressError, UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.bus.buses import LOCAL, open_bus
@@ -34,11 +34,14 @@ from eqrt.runtime.operation.metrics import BUCKETS_S, METRICS, Latencies, render
 from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.output.status import BusStatus, ServiceStatus, SourceStatus
 from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.status_book import StatusBook
+from no_channels import NoChannels
 from processes import PATIENCE_S, Serving, eqrt
 from source_tree import ROOT
 
 STATES = ("UP", "ERROR_PASSIVE", "BUS_OFF", "DOWN")
+EGO_MOTION = 0x5A0  # of the generic object list
 SAMPLE = re.compile(r'^(\w+)(?:\{((?:\w+="(?:[^"\\\n]|\\[\\"n])*",?)+)\})? (\S+)$')
 
 
@@ -52,6 +55,7 @@ def status() -> ServiceStatus:
     return msgspec.structs.replace(
         made,
         mode=int(Mode.RUN),
+        ego_known=True,
         tile='/a "b"\\c\nd',
         latencies_s=[0.004, 0.005, 0.012, 9.0],
         totals=made.totals | {"pipeline_cycles": 7},
@@ -168,11 +172,30 @@ def test_health_says_why_not(status: ServiceStatus) -> None:
         (None, "no second has passed"),
         (msgspec.structs.replace(status, mode=int(Mode.SILENT), mode_s=7.2), "no input for 7 s"),
         (msgspec.structs.replace(status, totals={}), "no object cycle"),
+        (msgspec.structs.replace(status, ego_known=False), "no ego motion"),
         (msgspec.structs.replace(status, time_s=now_s - 9.0), "busy for 9 s"),
     ):
         is_well, told = health(changed, now_s)
         assert not is_well
         assert reason in str(told["reason"])
+
+
+@pytest.mark.parametrize("ego_moves", [True, False])
+def test_a_service_without_ego_motion_is_not_well_one_without_a_place_in_the_map_is(
+    *, ego_moves: bool
+) -> None:
+    """Both are in NO_POSE; but the latter predicts, without the map."""
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(TILE))
+    book = StatusBook(pipeline, NoChannels(), [])
+    for message in cycle([Car(object_id=1, x_m=5.0, y_m=0.0)], 0.0):
+        if ego_moves or message.arbitration_id != EGO_MOTION:
+            for forecast in pipeline.feed(message, 0.0):
+                book.published(forecast)
+    now_s = time.monotonic() + 1.0
+    is_well, told = health(book.close(now_s), now_s)
+    reason = "" if ego_moves else "no ego motion: nothing is predicted"
+    assert (is_well, told["mode"], told["objects"]) == (ego_moves, "NO_POSE", int(ego_moves))
+    assert told["reason"] == reason
 
 
 # --- who may ask, and how

@@ -126,7 +126,8 @@ def test_modes_are_told_when_they_change(quiet: ServiceStatus) -> None:
     statuses = [msgspec.structs.replace(quiet, mode=int(mode)) for mode in modes]
     assert told(*statuses) == [
         "mode NO_MAP: predicting without a map",
-        "warning: mode LATE: predictions take longer than a model step",
+        "warning: mode LATE: predictions come late, or there is no time for the model on some "
+        "objects",
         "warning: mode SILENT: no input; everything said before is void",
     ]
     assert set(MODES) == set(Mode)

@@ -25,6 +25,7 @@ def guarded(raw: Raw) -> Guarded:
         targets.valid,
         DT_S,
         object_class=targets.object_class,
+        measured=targets.velocity,
         covariances=raw.covariances,
     )
 
@@ -131,12 +132,61 @@ def test_a_target_the_model_said_nothing_about_goes_on_turning() -> None:
     assert off_m < 0.5 * np.linalg.norm(straight[-1] - circle[-1])
 
 
-def test_a_target_seen_once_falls_back_to_standing() -> None:
-    raw = driving()
-    raw.targets.valid[0, :-1] = False
-    raw.targets.history[0, :-1] = np.nan
+def seen_once(*measured: tuple[float, float]) -> Raw:
+    """Targets at (0, 0) of which the sensor says these velocities, and the model nothing."""
+    raw = driving(targets=len(measured))
+    raw.targets.valid[:, :-1] = False
+    raw.targets.history[:, :-1] = np.nan
+    raw.targets.velocity[:] = measured
     raw.trajectories[:] = np.nan
-    np.testing.assert_array_equal(guarded(raw).trajectories, 0.0)
+    return raw
+
+
+def test_a_target_seen_once_falls_back_to_the_velocity_that_was_measured() -> None:
+    found = guarded(seen_once((-25.0, 3.0), (0.0, 0.0)))
+    np.testing.assert_array_equal(found.velocity, [[-25.0, 3.0], [0.0, 0.0]])
+    np.testing.assert_allclose(found.trajectories[0, 0], np.outer(AHEAD_S, [-25.0, 3.0]))
+    np.testing.assert_array_equal(found.trajectories[1], 0.0)
+
+
+@pytest.mark.parametrize(
+    "measured", [(np.nan, np.nan), (5.0, np.nan), (90.1, 0.0), (64.0, -64.0), (np.inf, 0.0)]
+)
+def test_a_target_seen_once_has_no_velocity_if_none_was_measured(
+    measured: tuple[float, float],
+) -> None:
+    """Or half of one, or one that nothing has. It falls back to its place."""
+    found = guarded(seen_once(measured))
+    assert np.isnan(found.velocity).all()
+    np.testing.assert_array_equal(found.trajectories, 0.0)
+
+
+def test_a_velocity_may_be_measured_as_fast_as_anything_on_a_road() -> None:
+    np.testing.assert_array_equal(guarded(seen_once((0.0, -90.0))).velocity, [[0.0, -90.0]])
+
+
+def test_without_a_sensor_that_measures_velocities_a_target_seen_once_has_none() -> None:
+    raw = seen_once((-25.0, 3.0))
+    targets = raw.targets
+    found = guard(raw.trajectories, raw.probabilities, targets.history, targets.valid, DT_S)
+    assert np.isnan(found.velocity).all()
+
+
+def test_what_was_measured_does_not_replace_what_the_history_tells() -> None:
+    raw = driving()
+    raw.targets.velocity[:] = (-25.0, 3.0)
+    raw.targets.valid[:, :-2] = False
+    np.testing.assert_allclose(guarded(raw).velocity, [[12.0, 0.0]])
+
+
+def test_the_model_may_not_contradict_what_was_measured_of_a_target_seen_once() -> None:
+    """It starts as the sensor says, to 2 m; where that says nothing, where the target is."""
+    raw = seen_once((-25.0, 0.0), (-15.0, 0.0), (np.nan, np.nan))
+    raw.trajectories[:] = 0.0
+    found = guarded(raw)
+    np.testing.assert_array_equal(found.accepted, [False, True, True])
+    np.testing.assert_allclose(found.trajectories[0, 0, -1], [-75.0, 0.0])
+    assert np.isnan(found.velocity[2]).all()
 
 
 # --- what each class can do

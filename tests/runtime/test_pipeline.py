@@ -360,6 +360,7 @@ def test_without_ego_motion_nothing_is_predicted_unless_the_sensor_stands_still(
     alone = [m for m in traffic(CARS, 0.5) if m.arbitration_id != 0x5A0]
     forecasts = feed(pipeline_of(), alone)
     assert {(f.mode, f.num_targets) for f in forecasts} == {(Mode.NO_POSE, 0)}
+    assert {f.map_from_ego for f in forecasts} == {None}
     profile = load_profile("generic")
     standing = feed(Pipeline(profile, shipped_predictor(), stationary=True), alone)
     assert {(f.mode, f.num_targets) for f in standing} == {(Mode.NO_MAP, 3)}
@@ -447,6 +448,45 @@ def test_a_model_that_raises_costs_its_cycle_and_no_other() -> None:
     assert modes == [Mode.NO_MAP] * 5 + [Mode.FALLBACK] * 5 + [Mode.NO_MAP] * 11
     assert np.isfinite(forecasts[5].trajectories).all()
     assert (pipeline.counters.model_errors, pipeline.counters.fallbacks) == (1, 3)
+
+
+ONCOMING = Car(object_id=7, x_m=120.0, y_m=0.0, speed_mps=-25.0)
+
+
+@pytest.mark.parametrize("model", [Stub, lambda: Raising({0}), lambda: Altered(slice(1), 1e9)])
+def test_a_car_that_was_seen_once_goes_on_as_the_sensor_says(model: Callable[[], Model]) -> None:
+    """Whether the model fails or has another opinion: 75 m nearer after 3 s, not where it is."""
+    (forecast,) = feed(pipeline_with(model()), cycle([ONCOMING], 0.0))
+    np.testing.assert_allclose(forecast.velocity, [[-25.0, 0.0]], atol=0.05)
+    np.testing.assert_allclose(forecast.trajectories[0, 0, -1], [45.0, 0.0], atol=0.2)
+    assert not forecast.is_standstill_assumed.any()
+
+
+def test_a_car_that_was_seen_once_goes_on_though_there_is_no_time_for_the_model() -> None:
+    model = Slow(0.01)
+    model.now_s = 0.08
+    pipeline = pipeline_with(model, model.clock)
+    (forecast,) = pipeline_fed(pipeline, cycle([ONCOMING], 0.0), 0.0)
+    assert forecast.agent_mode.tolist() == [Mode.LATE]
+    np.testing.assert_allclose(forecast.trajectories[0, 0, -1], [45.0, 0.0], atol=0.2)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_of_what_was_seen_once_by_a_sensor_that_measures_no_velocity_none_is_known(
+    tmp_path: Path, *, fails: bool
+) -> None:
+    """Only the model can say where it goes. From the second cycle on there is a velocity."""
+    model = Raising({0, 1} if fails else ())
+    pipeline = Pipeline(profile_of(tmp_path, COUNTED), model)
+    made = []
+    for step in range(2):
+        for message in (header(1, step), first(20.0 - step, 0.0, 5, counter=step)):
+            made += pipeline.feed(message, step / 10)
+    made += pipeline.finish(0.1)
+    assert np.isnan(made[0].velocity).all()
+    assert made[0].is_standstill_assumed.tolist() == [fails]
+    np.testing.assert_allclose(made[1].velocity, [[-10.0, 0.0]], atol=0.1)
+    assert made[1].is_standstill_assumed.tolist() == [False]
 
 
 def test_a_prediction_that_took_longer_than_a_period_says_so() -> None:

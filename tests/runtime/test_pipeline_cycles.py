@@ -182,7 +182,8 @@ def test_silence_says_nothing_but_how_long_it_has_lasted(profile: Profile) -> No
     (silent,) = road.pipeline.poll(11.0)
     assert (silent.mode, silent.num_targets, silent.cycle) == (Mode.SILENT, 0, 1)
     assert (silent.timestamp_s, silent.made_s, silent.compute_s) == (10.0, 11.0, 0.0)
-    assert silent.map_from_ego == Pose2()
+    assert np.isnan(silent.received_s)
+    assert silent.map_from_ego is None
     assert np.isnan(silent.ego_speed_mps)
     assert silent.trajectories.shape == (0, CONTRACT.num_modes, CONTRACT.horizon_steps, 2)
 
@@ -248,6 +249,60 @@ def test_a_cycle_is_late_if_it_is_out_more_than_a_period_after_it_came(
     assert road.predict(at_s=7.0 + (3 - ticks) / 64).mode is mode
 
 
+def closed_by_timeout(road: Road, *, last_s: float, closed_s: float, state: int = 2) -> ForecastSet:
+    """A cycle whose header came at 7 s and announced two objects, of which one came at `last_s`."""
+    for message, at_s in ((header(2), 7.0), (first(10.0, 0.0, 1, state=state), last_s)):
+        assert road.pipeline.feed(message, at_s) == []
+    (made,) = road.pipeline.poll(closed_s)
+    assert (made.received_s, made.timestamp_s) == (last_s, 7.0)
+    return made
+
+
+@pytest.mark.parametrize(("last_s", "mode"), [(7.0, Mode.LATE), (7.015625, Mode.NO_MAP)])
+def test_a_cycle_that_waited_for_a_message_in_vain_is_late_by_the_last_one_that_came(
+    profile: Profile, last_s: float, mode: Mode
+) -> None:
+    """More than a period after it, though it was made as soon as it was closed."""
+    road = Road(profile, clock=lambda: 7.140625)
+    made = closed_by_timeout(road, last_s=last_s, closed_s=7.140625, state=0)
+    assert (made.mode, made.num_targets, made.made_s) == (mode, 0, 7.140625)
+
+
+@pytest.mark.parametrize(("last_s", "mode"), [(7.0, Mode.LATE), (7.03125, Mode.PARTIAL)])
+def test_the_time_of_the_model_counts_from_the_last_message_that_came(
+    profile: Profile, last_s: float, mode: Mode
+) -> None:
+    """Of a period of 125 ms, 87.5 are the model's; the cycle was closed after 110."""
+    model = Steady()
+    road = Road(profile, model, clock=lambda: 7.109375, run_by=Direct)
+    made = closed_by_timeout(road, last_s=last_s, closed_s=7.109375)
+    assert made.agent_mode.tolist() == [mode]
+    assert len(model.scenes) == (mode is Mode.PARTIAL)
+
+
+def test_where_no_time_passes_nothing_is_late(profile: Profile) -> None:
+    """In a log, only the next message tells that the time of a cycle is over."""
+    made = closed_by_timeout(Road(profile), last_s=7.0, closed_s=7.9)
+    assert (made.mode, made.agent_mode.tolist()) == (Mode.NO_MAP, [Mode.PARTIAL])
+
+
+def test_a_cycle_from_before_the_clock_was_set_back_is_not_waited_for(profile: Profile) -> None:
+    """It came now, as far as deadlines go; else the model would have thousands of seconds."""
+    granted_s: list[float] = []
+
+    class Patient(Direct):
+        def run(self, scene: Scene, patience_s: float) -> Prediction:
+            granted_s.append(patience_s)
+            return super().run(scene, patience_s)
+
+    road = Road(profile, clock=lambda: 100.0, run_by=Patient)
+    for message in (header(2), first(10.0, 0.0, 1)):
+        assert road.pipeline.feed(message, 5000.0) == []
+    (made,) = road.pipeline.poll(100.0)
+    assert made.received_s == 100.0
+    assert granted_s == [DT_S]
+
+
 @pytest.fixture
 def over() -> Iterator[threading.Event]:
     event = threading.Event()
@@ -271,6 +326,9 @@ def test_a_model_that_hangs_is_waited_for_until_the_period_is_over(
     counters = road.pipeline.counters
     assert (counters.model_overruns, counters.shed, counters.fallbacks) == (1, 2, 0)
     assert (counters.model_errors, counters.model_restarts) == (0, 0)
+    again = road.predict(5, 6, at_s=time.monotonic())  # it is not asked: it is still at work
+    assert (again.mode, again.agent_mode.tolist()) == (Mode.LATE, [Mode.LATE, Mode.LATE])
+    assert (counters.model_overruns, counters.shed, counters.fallbacks) == (1, 4, 0)
 
 
 # --- what it says
@@ -319,6 +377,7 @@ def test_a_forecast_says_what_is_known_of_its_targets_and_of_the_ego_vehicle() -
     assert (forecast.cycle, forecast.timestamp_s, forecast.dt_s) == (3, 100.375, DT_S)
     assert (forecast.model_id, forecast.tile_id) == ("steady", "")
     assert forecast.ego_speed_mps == pytest.approx(3.0)
+    assert forecast.map_from_ego is not None
     assert forecast.map_from_ego.x_m == pytest.approx(3.0 * 0.375)
     assert forecast.object_id.tolist() == [7, 3]
     assert forecast.track_id.tolist() == [1, 2]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drives import DRIVES, Drive, first_seconds, shipped_predictor
+from eqrt.core.kinematics import FIT_STEPS
 from eqrt.runtime.bus.candump import candump_message
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet
@@ -69,8 +70,11 @@ def random_message(ids: list[int], random: np.random.Generator) -> can.Message:
 
 def assert_sound(forecast: ForecastSet) -> int:
     assert len(set(forecast.track_id.tolist())) == forecast.num_targets
-    for values in (forecast.position, forecast.velocity, forecast.trajectories):
+    for values in (forecast.position, forecast.trajectories):
         assert np.isfinite(values).all()
+    assert not np.isinf(forecast.velocity).any()
+    seen_more = forecast.history_valid[:, -FIT_STEPS:].sum(axis=1) > 1
+    assert np.isfinite(forecast.velocity[seen_more]).all()
     assert (np.diff(forecast.probabilities, axis=1) <= 0.0).all()
     np.testing.assert_allclose(forecast.probabilities.sum(axis=1), 1.0, atol=1e-3)
     assert (forecast.age_s >= -1e-6).all()

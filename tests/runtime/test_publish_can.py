@@ -169,6 +169,7 @@ def test_a_car_ahead_reads_as_such_on_classic_can(classic: Wire) -> None:
 
 def test_every_object_is_decoded_to_within_half_a_step(fd: Wire) -> None:
     forecasts = nearest_first(many(32))
+    assert forecasts.map_from_ego is not None
     ego_from_map = forecasts.map_from_ego.inverse()
     expected = ego_from_map.apply(forecasts.trajectories[:, 0, 2::3])
     _, *decoded = fd.decoded(forecasts)
@@ -233,6 +234,22 @@ def test_what_is_not_known_is_marked_not_available(fd: Wire) -> None:
     assert car["X10"] == pytest.approx(40.0)
 
 
+@pytest.mark.parametrize("mode", [Mode.LATE, Mode.FALLBACK])
+def test_physics_without_a_velocity_gives_no_points(fd: Wire, classic: Wire, mode: Mode) -> None:
+    """It would be sent as standing; where it is, is known. The model needs no velocity."""
+    unknown = replace(one_car(), velocity=np.full((1, 2), np.nan))
+    by_physics = replace(unknown, agent_mode=np.array([mode], np.uint8))
+    _, (_, car) = fd.decoded(by_physics)
+    assert {car[f"{axis}{i}"] for axis in "XY" for i in range(1, 11)} == {NOT_AVAILABLE}
+    assert car["PositionX"] == pytest.approx(20.0)
+    points = [values for name, values in classic.decoded(by_physics) if "Point" in name]
+    assert {point[axis] for point in points for axis in "XY"} == {NOT_AVAILABLE}
+    _, (_, car) = fd.decoded(unknown)
+    assert car["X10"] == pytest.approx(50.0)
+    _, (_, car) = fd.decoded(replace(one_car(), agent_mode=by_physics.agent_mode))
+    assert car["X10"] == pytest.approx(50.0)
+
+
 def test_points_beyond_the_horizon_are_not_available(fd: Wire, classic: Wire) -> None:
     """Half a second of forecast fills five points of 0.1 s, and no whole second."""
     forecasts = one_car()
@@ -243,6 +260,19 @@ def test_points_beyond_the_horizon_are_not_available(fd: Wire, classic: Wire) ->
     assert {car[f"{axis}{i}"] for axis in "XY" for i in range(6, 11)} == {NOT_AVAILABLE}
     points = [values["X"] for name, values in classic.decoded(forecasts) if "Point" in name]
     assert points == [NOT_AVAILABLE] * 3
+
+
+def test_where_the_ego_vehicle_is_not_known_so_is_all_that_is_seen_from_it(
+    fd: Wire, classic: Wire
+) -> None:
+    """Its pose, and whatever somebody wants to be sent from there."""
+    (_, status), (_, car) = fd.decoded(replace(one_car(), map_from_ego=None))
+    assert {status[name] for name in ("EgoX", "EgoY", "EgoYaw")} == {NOT_AVAILABLE}
+    places = {f"{name}{axis}" for name in ("Position", "Velocity") for axis in "XY"}
+    places |= {f"{axis}{i}" for i in range(1, 11) for axis in "XY"}
+    assert {car[place] for place in places} == {NOT_AVAILABLE}
+    points = [v for name, v in classic.decoded(replace(one_car(), map_from_ego=None)) if "X" in v]
+    assert [point["X"] for point in points] == [NOT_AVAILABLE] * 3
 
 
 def test_old_input_is_as_old_as_can_be_said(fd: Wire) -> None:
@@ -364,6 +394,7 @@ def test_the_nearest_object_goes_first_with_all_that_is_said_of_it(
         int(v["TrackId"]) for _, v in decoded if v.get("ObjectIndex") == 0 if "TrackId" in v
     }
     ego = forecasts.map_from_ego
+    assert ego is not None
     away_m = np.linalg.norm(forecasts.position - (ego.x_m, ego.y_m), axis=1)
     assert nearest == forecasts.track_id[np.argmin(away_m)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import fields, replace
 
@@ -46,6 +47,7 @@ def test_every_kind_of_message_comes_back_as_it_was(message: can.Message) -> Non
 FORECASTS = {
     "one": one_car(),
     "nobody": nobody(),
+    "nowhere": replace(nobody(), map_from_ego=None),
     "many": many(70),
     "covariances": replace(many(3), covariances=np.random.default_rng(0).random((3, 6, 30, 2, 2))),
 }
@@ -74,6 +76,12 @@ def test_forecasts_come_back_to_the_last_bit(name: str) -> None:
 def test_other_bytes_are_no_forecasts(payload: bytes) -> None:
     with pytest.raises(ValueError, match=r"forecasts|Mode"):
         decode_forecasts(payload)
+
+
+def test_forecasts_of_an_older_recording_do_not_tell_when_their_input_came() -> None:
+    plain = msgspec.msgpack.decode(encode_forecasts(one_car()))
+    del plain["received_s"]
+    assert math.isnan(decode_forecasts(msgspec.msgpack.encode(plain)).received_s)
 
 
 def test_an_array_of_objects_is_refused() -> None:

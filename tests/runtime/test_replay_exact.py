@@ -38,14 +38,16 @@ def said(recording: Recording) -> bytes:
 
 
 def test_runs_that_were_given_up_are_given_up_again(tmp_path: Path) -> None:
-    """And those that fell back because the model was still at work; by a model that is quick."""
+    """And those that were not begun because the model was still at work, and those that failed; by
+    a model that is quick and well.
+    """
     folder = tmp_path / "rec"
     with recorded_drive("ngsim", folder, tmp_path / "drive.log", command=SLOW_EQRT) as (service, _):
         assert service.end()[0] == 0
     (recording,) = read_recordings(folder)
     outcomes = [outcome for step in recording.steps() for outcome in step.outcomes]
-    assert outcomes.count(Outcome.GIVEN_UP) >= 3
-    assert outcomes.count(Outcome.FAILED) >= 3
+    assert outcomes.count(Outcome.GIVEN_UP) >= 6
+    assert outcomes.count(Outcome.FAILED) >= 1
     modes = {int(mode) for one in recording.forecasts() for mode in one.agent_mode}
     assert {Mode.LATE, Mode.FALLBACK} <= modes
     lines = tmp_path / "replayed.jsonl"

@@ -42,6 +42,7 @@ def forecast(
     return ForecastSet(
         cycle=0,
         timestamp_s=time_s,
+        received_s=time_s,
         made_s=time_s,
         compute_s=0.0,
         mode=Mode.RUN,

@@ -192,6 +192,7 @@ def test_the_bus_and_the_datagrams_say_the_same(name: str, served: dict[str, Ser
         assert status["Mode"] == forecast.mode
         assert status["NumObjects"] == forecast.num_targets == len(rows)
         assert status["ComputeTime"] == pytest.approx(1e3 * forecast.compute_s, abs=0.06)
+        assert forecast.map_from_ego is not None
         ego_from_map = forecast.map_from_ego.inverse()
         for row, fields in enumerate(rows):
             assert fields["ObjectIndex"] == row

@@ -9,13 +9,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 
 import can
 import msgspec
 import numpy as np
 import pytest
 
-from drives import DRIVES, first_seconds, shipped_predictor
+from drives import DRIVES, Car, cycle, first_seconds, shipped_predictor
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
 from eqrt.runtime.bus.health import BusHealth, BusWord
@@ -241,6 +242,18 @@ def test_silence_is_said_when_the_radar_has_stopped_and_not_before(radar: Pipeli
     assert silent.made_s - said.forecasts[first_silent - 1].timestamp_s >= 0.3
 
 
+def test_the_latency_of_a_cycle_that_lacks_a_message_counts_from_the_last_one_that_came() -> None:
+    """The sensor's timeout of 50 ms is a part of it."""
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor(), clock=time.monotonic)
+    statuses: list[ServiceStatus] = []
+    queue = Queue(0.1, then_s=1.5)
+    cars = [Car(object_id=n, x_m=20.0 + n, y_m=0.0) for n in range(2)]
+    queue.messages = deque(cycle(cars, 0.0, start_s=time.time())[:-1])
+    Service(pipeline, queue, [Said()], [statuses.append]).run(queue.is_over)
+    (latency_s,) = statuses[0].latencies_s
+    assert 0.05 < latency_s < 1.0
+
+
 def test_every_second_there_is_a_line_while_a_bus_is_served(radar: Pipeline) -> None:
     """On the local bus, on which the recorded radar is played."""
     channel = next(CHANNELS)
@@ -291,7 +304,7 @@ def book(pipeline: Pipeline, forecasts: Iterable[ForecastSet]) -> StatusBook:
     """Of a service that has said these, each 12 ms after its last message came."""
     found = StatusBook(pipeline, Queue(0.1), [])
     for forecast in forecasts:
-        found.published(forecast, time.monotonic() - 0.012)
+        found.published(replace(forecast, received_s=time.monotonic() - 0.012))
         pipeline.counters.cycles += 1
     return found
 
@@ -323,11 +336,11 @@ def test_the_status_says_since_when_the_mode_holds(radar: Pipeline) -> None:
     status = pages.close(begun_s + 5.0)
     assert (status.mode, status.objects) == (Mode.SILENT, 0)
     assert status.mode_s == pytest.approx(5.0, abs=0.5)
-    pages.published(one_car(), begun_s)
+    pages.published(one_car())
     status = pages.close(begun_s + 7.0)
     assert (status.mode, status.objects) == (Mode.NO_MAP, 1)
     assert status.mode_s == pytest.approx(7.0, abs=0.5)
-    pages.published(one_car(), begun_s)
+    pages.published(one_car())
     assert pages.close(begun_s + 9.0).mode_s == pytest.approx(9.0, abs=0.5)
 
 

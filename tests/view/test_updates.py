@@ -67,10 +67,12 @@ def test_what_lies_too_far_out_is_no_place_rather_than_a_wrong_one() -> None:
 
 
 def test_a_cycle_without_an_ego_pose_tells_none() -> None:
-    silent = replace(nobody(), map_from_ego=Pose2(), ego_speed_mps=math.nan)
-    head, _ = decode_update(update_of(silent))
-    assert head["ego"] is None
-    assert head["level"] == "bad"
+    """Nor does one from a recording of before there was None."""
+    for nowhere in (None, Pose2()):
+        silent = replace(nobody(), map_from_ego=nowhere, ego_speed_mps=math.nan)
+        head, _ = decode_update(update_of(silent))
+        assert head["ego"] is None
+        assert head["level"] == "bad"
     standing = replace(one_car(), ego_speed_mps=0.0)
     assert decode_update(update_of(standing))[0]["ego"] == pytest.approx([100, 200, math.pi / 2])
 
@@ -80,6 +82,16 @@ def test_a_heading_is_measured_or_where_it_drives_to_or_not_known() -> None:
     forecast.velocity[1] = (0.0, -3.0)
     forecast.velocity[2] = (0.1, 0.1)
     np.testing.assert_allclose(course_rad(forecast), [0.5, -math.pi / 2, np.nan])
+
+
+def test_what_only_seems_to_stand_is_not_said_to_be_predicted() -> None:
+    unknown = replace(one_car(), velocity=np.full((1, 2), np.nan))
+    late = replace(unknown, agent_mode=np.array([Mode.LATE], np.uint8))
+    agents = decode_update(update_of(late))[0]["agents"]
+    assert agents["words"] == ["not predicted: nothing tells how it moves"]
+    assert agents["speed_mps"] == [None]
+    agents = decode_update(update_of(unknown))[0]["agents"]
+    assert agents["words"] == ["by the model, from a short history"]
 
 
 def test_an_ellipse_holds_half_of_the_distribution() -> None:

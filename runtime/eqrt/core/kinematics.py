@@ -45,7 +45,11 @@ def constant_turn(
     horizon_steps: int,
     dt_s: float,
 ) -> Float64:
-    """Constant turn rate and velocity (CTRV): (B, 2), (B, 2) m/s, (B,) -> positions (B, H, 2)."""
+    """Constant turn rate and velocity (CTRV): (B, 2), (B, 2) m/s, (B,) -> positions (B, H, 2).
+
+    What has no known velocity (NaN) stays where it is.
+    """
+    velocity = np.where(np.isnan(velocity), 0.0, velocity)
     time = np.arange(1, horizon_steps + 1)[None] * dt_s  # (1, H)
     turned = turn_rate_rad_s[:, None] * time
     along = time * np.sinc(turned / np.pi)  # sin(wt) / w, defined at w = 0
@@ -59,8 +63,9 @@ def constant_turn(
 def fit_motion(history: Float64, valid: Bool, dt_s: float) -> tuple[Float64, Float64]:
     """Velocity (B, 2) in m/s and turn rate (B,) in rad/s now, from histories (B, T, 2).
 
-    The velocity is the least-squares slope over the last second. The turn rate compares it with the
-    slope over the second before, and is 0 for a target too slow or too shortly seen to tell.
+    The velocity is the least-squares slope over the last second, NaN where that has fewer than two
+    valid steps. The turn rate compares it with the slope over the second before, and is 0 for a
+    target too slow or too shortly seen to tell.
     """
     steps = valid.shape[1]
     half = min(FIT_STEPS, steps)
@@ -69,18 +74,20 @@ def fit_motion(history: Float64, valid: Bool, dt_s: float) -> tuple[Float64, Flo
     apart_s = 0.5 * steps * dt_s  # between the middles of the two windows
     cross = before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]
     turned = np.arctan2(cross, (before * now).sum(-1))
-    slow = np.minimum(np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1)) < TURNING_MPS
-    return now, np.where(slow, 0.0, np.clip(turned / apart_s, -MAX_TURN_RAD_S, MAX_TURN_RAD_S))
+    slower = np.minimum(np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1))
+    turn_rate = np.clip(turned / apart_s, -MAX_TURN_RAD_S, MAX_TURN_RAD_S)
+    return now, np.where(slower >= TURNING_MPS, turn_rate, 0.0)  # 0 where either is NaN
 
 
 def _slope(history: Float64, valid: Bool, dt_s: float) -> Float64:
-    """Least-squares velocity (B, 2) over the valid steps of (B, T, 2); 0 with fewer than two."""
+    """Least-squares velocity (B, 2) over the valid steps of (B, T, 2); NaN with fewer than two."""
     time = np.arange(valid.shape[1]) * dt_s
-    count = np.maximum(valid.sum(axis=1, keepdims=True), 1)
-    centred = np.where(valid, time - (valid * time).sum(axis=1, keepdims=True) / count, 0.0)
-    spread = np.maximum((centred**2).sum(axis=1), 0.25 * dt_s**2)
+    count = valid.sum(axis=1, keepdims=True)
+    mean = (valid * time).sum(axis=1, keepdims=True) / np.maximum(count, 1)
+    centred = np.where(valid, time - mean, 0.0)
+    spread = np.where(count < 2, np.nan, (centred**2).sum(axis=1, keepdims=True))
     seen = np.where(valid[..., None], history, 0.0)
-    return np.asarray((centred[..., None] * seen).sum(axis=1) / spread[:, None])
+    return np.asarray((centred[..., None] * seen).sum(axis=1) / spread)
 
 
 def _velocity_start(valid: Bool, last: NDArray[np.intp]) -> NDArray[np.intp]:

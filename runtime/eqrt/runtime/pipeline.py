@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import can
 import numpy as np
 
-from eqrt.core.frames import Pose2
 from eqrt.core.lane_choice import centerline_source
 from eqrt.core.scene import CenterlineSource
 from eqrt.runtime.decoding.can_io import Decoder, Event
@@ -197,7 +196,8 @@ class Pipeline:
         self._predicted_s = timestamp_s
         self._silent_due_s = now_s + SILENT_PERIODS * self.predictor.contract.dt_s
         self.times.tracks_s = self._time(now_s) - started_s
-        return self._predict(ego, _Moment(timestamp_s, now_s, started_s))
+        received_s = min(detections.received_s, now_s)  # later only if the clock was set back
+        return self._predict(ego, _Moment(timestamp_s, received_s, now_s, started_s))
 
     def _predict(self, ego: EgoState | None, moment: _Moment) -> ForecastSet:
         tracks = self.tracks.snapshot(moment.measured_s, NEIGHBOR_AGE_S)
@@ -211,8 +211,8 @@ class Pipeline:
     def _deadline(self, moment: _Moment) -> Deadline:
         if self._clock is None:
             return Deadline(lambda: moment.now_s, np.inf, np.inf)
-        dt_s = self.predictor.contract.dt_s
-        return Deadline(self._clock, moment.now_s + SHED_PERIODS * dt_s, moment.now_s + dt_s)
+        dt_s, received_s = self.predictor.contract.dt_s, moment.received_s
+        return Deadline(self._clock, received_s + SHED_PERIODS * dt_s, received_s + dt_s)
 
     def _forecast(
         self, raw: Raw, ego: EgoState | None, moment: _Moment, *, silent: bool = False
@@ -226,6 +226,7 @@ class Pipeline:
             targets.valid,
             dt_s,
             object_class=targets.object_class,
+            measured=targets.velocity,
             covariances=raw.covariances,
         )
         made_s = self._time(moment.now_s)
@@ -233,19 +234,21 @@ class Pipeline:
         self._count(raw, guarded)
         mode = Mode.SILENT
         if not silent:
-            overdue, has_tile = made_s - moment.now_s > dt_s, self.tile is not None
+            overdue = self._clock is not None and made_s - moment.received_s > dt_s
+            has_tile = self.tile is not None
             reasons = cycle_reasons(raw, guarded, ego, has_tile=has_tile, overdue=overdue)
             mode = self._modes.cycle(reasons, moment.now_s)
         used_tile = self.tile if raw.has_lanes else None
         return ForecastSet(
             cycle=self.counters.cycles - 1,
             timestamp_s=moment.measured_s,
+            received_s=moment.received_s,
             made_s=made_s,
             compute_s=made_s - moment.started_s,
             mode=mode,
             model_id=self.predictor.model_id,
             tile_id=used_tile.info.tile_id if used_tile else "",
-            map_from_ego=ego.map_from_ego if ego else Pose2(),
+            map_from_ego=ego.map_from_ego if ego else None,
             ego_speed_mps=ego.velocity[0] if ego else np.nan,
             dt_s=dt_s,
             track_id=targets.track_id,
@@ -276,7 +279,7 @@ class Pipeline:
         counters.model_restarts = self._runner.restarts
 
     def _silence(self, now_s: float) -> ForecastSet:
-        moment = _Moment(self._predicted_s, now_s, now_s)
+        moment = _Moment(self._predicted_s, np.nan, now_s, now_s)
         return self._forecast(self._nobody, None, moment, silent=True)
 
     def _time(self, now_s: float) -> float:
@@ -289,8 +292,10 @@ class _Moment:
 
     measured_s: float
     """The newest measurement in it."""
+    received_s: float
+    """The cycle's last message arrived; NaN = there is no cycle."""
     now_s: float
-    """The message that completed the cycle arrived."""
+    """The cycle was closed: with that message, or when the next ones had been waited for."""
     started_s: float
     """Work on it began."""
 

@@ -101,10 +101,10 @@ class Service:
             message, now_s = self._receive()
             if self._witness:
                 self._witness.begin(message, now_s)
-            self._publish(self._pipeline.poll(now_s), now_s)
+            self._publish(self._pipeline.poll(now_s))
             if message is not None:
                 self._book.received()
-                self._publish(self._pipeline.feed(message, now_s), now_s)
+                self._publish(self._pipeline.feed(message, now_s))
             if self._witness:
                 self._witness.end()
             if (monotonic_s := time.monotonic()) >= report_due_s:
@@ -127,11 +127,11 @@ class Service:
         monotonic_s, wall_s = both_clocks()
         return message, self._clock.now_s(monotonic_s, message.timestamp, wall_s)
 
-    def _publish(self, forecasts: list[ForecastSet], arrived_s: float) -> None:
+    def _publish(self, forecasts: list[ForecastSet]) -> None:
         for forecast in forecasts:
             for publisher in self._publishers:
                 publisher.publish(forecast)
-            self._book.published(forecast, arrived_s)
+            self._book.published(forecast)
 
     def _report(self, now_s: float, due_s: float) -> float:
         """Say how the second was that has passed; returns when the next one ends."""

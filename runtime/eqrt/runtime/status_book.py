@@ -46,6 +46,7 @@ class StatusBook:
         self._started_s = self._mode_since_s = self._begun_s = time.monotonic()
         self._mode = Mode.SILENT
         self._objects = 0
+        self._ego_known = False
         self._messages = 0
         self._latencies_s: list[float] = []
 
@@ -53,14 +54,15 @@ class StatusBook:
         """A message came."""
         self._messages += 1
 
-    def published(self, forecast: ForecastSet, arrived_s: float) -> None:
-        """A cycle, whose last message came at `arrived_s`, has been sent."""
+    def published(self, forecast: ForecastSet) -> None:
+        """A cycle has been sent."""
         now_s = time.monotonic()
         if forecast.mode != self._mode:
             self._mode, self._mode_since_s = forecast.mode, now_s
         self._objects = forecast.num_targets
+        self._ego_known = forecast.map_from_ego is not None
         if forecast.num_targets:
-            self._latencies_s.append(now_s - arrived_s)
+            self._latencies_s.append(now_s - forecast.received_s)
 
     def close(self, now_s: float) -> ServiceStatus:
         """What the period was; the next one begins at `now_s` (monotonic clock)."""
@@ -83,6 +85,7 @@ class StatusBook:
             latencies_s=self._latencies_s,
             stages_s={name.removesuffix("_s"): s for name, s in asdict(pipeline.times).items()},
             totals=self._totals(),
+            ego_known=self._ego_known,
             buses=[_bus(one, now_s) for one in self._channels.health()],
             sources=self._sources(now_s),
         )

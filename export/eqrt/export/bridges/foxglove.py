@@ -40,6 +40,7 @@ from eqrt.runtime.recording.json_schemas import json_schema
 from eqrt.runtime.recording.reader import Recording
 from eqrt.runtime.recording.topics import TILE_FILE
 from eqrt.runtime.status_book import status_line
+from eqrt.runtime.view.updates import ego_pose
 
 MAP, EGO = "map", "ego"
 _SHOWN_S = 0.5  # an object that is predicted no more disappears
@@ -62,9 +63,10 @@ class Cycle(msgspec.Struct, frozen=True, kw_only=True):
     compute_ms: float
     oldest_ms: float
     """The age of the oldest target."""
-    ego_x: float
-    ego_y: float
-    ego_yaw: float
+    ego_x: float | None
+    """None = not known, here and below."""
+    ego_y: float | None
+    ego_yaw: float | None
     ego_speed: float | None
 
 
@@ -98,31 +100,32 @@ def write_foxglove(recordings: Iterable[Recording], out: IO[bytes]) -> int:
 
 def _put_cycle(put: Any, moment: Moment, forecasts: ForecastSet) -> None:
     measured = _timestamp(moment.wall_ns(forecasts.timestamp_s))
-    pose = forecasts.map_from_ego
     put("/cycle", msgspec.json.encode(_cycle(forecasts)))
-    if forecasts.mode is not Mode.NO_POSE and forecasts.mode is not Mode.SILENT:
+    pose = ego_pose(forecasts)
+    if pose is not None and forecasts.mode is not Mode.NO_POSE:
+        x_m, y_m, yaw_rad = pose
         transform = FrameTransform(
             timestamp=measured,
             parent_frame_id=MAP,
             child_frame_id=EGO,
-            translation=Vector3(x=pose.x_m, y=pose.y_m),
-            rotation=_turned(pose.yaw_rad),
+            translation=Vector3(x=x_m, y=y_m),
+            rotation=_turned(yaw_rad),
         )
         put("/tf", transform.SerializeToString())
     put("/scene", _scene(measured, forecasts).SerializeToString())
 
 
 def _cycle(forecasts: ForecastSet) -> Cycle:
-    pose = forecasts.map_from_ego
+    x_m, y_m, yaw_rad = ego_pose(forecasts) or (None, None, None)
     return Cycle(
         mode=int(forecasts.mode),
         objects=forecasts.num_targets,
         fallbacks=int(np.count_nonzero(forecasts.agent_mode == Mode.FALLBACK)),
         compute_ms=1e3 * forecasts.compute_s,
         oldest_ms=1e3 * float(forecasts.age_s.max(initial=0.0)),
-        ego_x=pose.x_m,
-        ego_y=pose.y_m,
-        ego_yaw=pose.yaw_rad,
+        ego_x=x_m,
+        ego_y=y_m,
+        ego_yaw=yaw_rad,
         ego_speed=forecasts.ego_speed_mps if math.isfinite(forecasts.ego_speed_mps) else None,
     )
 

@@ -15,6 +15,7 @@ from typing import Any, Self
 import msgspec
 import numpy as np
 
+from eqrt.core.frames import Pose2
 from eqrt.runtime.output.datagrams import DatagramPublisher
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
@@ -124,18 +125,19 @@ def _tracks(forecasts: ForecastSet) -> Iterator[tuple[str, dict[str, Any]]]:
     }
     if forecasts.probabilities.shape[1]:
         columns["probability"] = forecasts.probabilities[:, 0]
-    if ego_pose(forecasts) is not None:
-        columns |= _places(forecasts)
+    if (pose := ego_pose(forecasts)) is not None:
+        columns |= _places(forecasts, Pose2(*pose).inverse())
     table = {name: values.tolist() for name, values in columns.items()}
     for row, track_id in enumerate(forecasts.track_id.tolist()):
         numbers = {name: values[row] for name, values in table.items()}
         yield f"track_{track_id}", {"mode": modes[row], **_known(numbers)}
 
 
-def _places(forecasts: ForecastSet) -> dict[str, np.ndarray[Any, np.dtype[np.float64]]]:
+def _places(
+    forecasts: ForecastSet, ego_from_map: Pose2
+) -> dict[str, np.ndarray[Any, np.dtype[np.float64]]]:
     """Columns: where each target was measured, and where its most probable mode will be."""
-    to_ego = forecasts.map_from_ego.inverse()
-    position = to_ego.apply(forecasts.position)
+    position = ego_from_map.apply(forecasts.position)
     columns = {
         "x": position[:, 0],
         "y": position[:, 1],
@@ -145,7 +147,7 @@ def _places(forecasts: ForecastSet) -> dict[str, np.ndarray[Any, np.dtype[np.flo
     for ahead_s in PREDICTED_S:
         step = round(ahead_s / forecasts.dt_s) - 1
         if num_modes and 0 <= step < horizon:
-            place = to_ego.apply(forecasts.trajectories[:, 0, step])
+            place = ego_from_map.apply(forecasts.trajectories[:, 0, step])
             columns[f"x_{ahead_s}s"], columns[f"y_{ahead_s}s"] = place[:, 0], place[:, 1]
     return columns
 

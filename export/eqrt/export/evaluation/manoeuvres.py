@@ -62,7 +62,7 @@ def speed_bands(windows: Windows, dt_s: float) -> Index:
     """(W,) which of SPEED_BANDS each target is in now: the fitted speed of its last second."""
     history = windows.history[:, 0].astype(np.float64)
     velocity, _ = fit_motion(history, windows.history_valid[:, 0], dt_s)
-    speed = np.linalg.norm(velocity, axis=1)
+    speed = np.nan_to_num(np.linalg.norm(velocity, axis=1))  # who was seen once counts as standing
     return np.asarray(np.searchsorted(SPEED_BANDS_MPS, speed, side="right"))
 
 

@@ -55,7 +55,8 @@ class BestMoment:
                 moment.lines[name].append(np.concatenate([start, line]))
             moment.lines["history"].append(np.array(histories[s.track_id]))
             moment.agents.append(start[0])
-        moment.ego = np.array([then.map_from_ego.x_m, then.map_from_ego.y_m])
+        if (pose := then.map_from_ego) is not None:
+            moment.ego = np.array([pose.x_m, pose.y_m])
         moment.is_north_known = tile is not None and then.mode is not Mode.NO_POSE
         if tile is not None:
             moment.lanes = _lanes_near(tile, np.concatenate(moment.lines["truth"]))

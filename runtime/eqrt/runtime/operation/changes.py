@@ -17,8 +17,9 @@ MODES = {
     Mode.NO_MAP: "predicting without a map",
     Mode.NO_POSE: "no ego motion, or no pose in the map",
     Mode.PARTIAL: "predicting from short histories",
-    Mode.LATE: "predictions take longer than a model step",
-    Mode.FALLBACK: "the model's predictions are refused; constant turn rate and velocity instead",
+    Mode.LATE: "predictions come late, or there is no time for the model on some objects",
+    Mode.FALLBACK: "the model fails, or what it says is refused; constant turn rate and velocity "
+    "instead",
     Mode.SILENT: "no input; everything said before is void",
 }
 """A mode in words, for whoever reads the log."""
@@ -61,7 +62,7 @@ class Counted:
 
 COUNTED = {
     "pipeline_fallbacks": Counted(
-        "fallback", "the model's prediction was refused for {} targets", Level.INFO
+        "fallback", "the model failed on {} targets, or what it said was refused", Level.INFO
     ),
     "pipeline_shed": Counted("shed", "no time for the model on {} targets; physics instead"),
     "pipeline_model_errors": Counted("model-error", "the model failed {} times"),

@@ -196,6 +196,8 @@ def _reason(status: ServiceStatus, now_s: float) -> str:
         return "no object cycle has come yet"
     if status.mode == Mode.SILENT:
         return f"no input for {status.mode_s:.0f} s"
+    if not status.ego_known:
+        return "no ego motion: nothing is predicted"
     return ""
 
 

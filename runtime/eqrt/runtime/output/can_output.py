@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eqrt.core.frames import wrap_angle
+from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.protection.e2e import crc_p2_rows, crc_p5_rows, data_id_of, data_ids_of
 
@@ -154,7 +154,7 @@ def protect(rows: Rows, arbitration_id: int, first_counter: int) -> None:
 
 
 def _status(forecasts: ForecastSet, num_modes: int, stride: int) -> Rows:
-    pose = forecasts.map_from_ego
+    pose = _map_from_ego(forecasts)
     row = np.zeros(1, STATUS)
     row["mode"] = forecasts.mode
     row["version"] = FORMAT_VERSION
@@ -172,7 +172,7 @@ def _status(forecasts: ForecastSet, num_modes: int, stride: int) -> Rows:
 
 
 def _trajectories(forecasts: ForecastSet, num_modes: int, stride: int) -> Rows:
-    ego_from_map = forecasts.map_from_ego.inverse()
+    ego_from_map = _map_from_ego(forecasts).inverse()
     objects = slice(_num_objects(forecasts))
     points = forecasts.trajectories[objects, :num_modes, stride - 1 :: stride]
     rows = np.zeros(points.shape[:2], TRAJECTORY)  # (A, modes)
@@ -191,7 +191,7 @@ def _trajectories(forecasts: ForecastSet, num_modes: int, stride: int) -> Rows:
     rows["velocity"] = _signed(velocity, _VELOCITY_MPS, 16)
     rows["point_step"] = _unsigned(stride * forecasts.dt_s, _AGE_S, 16)
     rows["points"] = _signed(math.nan, _POSITION_M, 16)  # those beyond the horizon stay so
-    rows["points"][:, :, : points.shape[2]] = _signed(ego_from_map.apply(points), _POSITION_M, 16)
+    rows["points"][:, :, : points.shape[2]] = _signed(_in_ego(points, forecasts), _POSITION_M, 16)
     return rows.ravel()
 
 
@@ -235,9 +235,22 @@ def _points_classic(forecasts: ForecastSet) -> Rows:
     rows["point"] = _signed(math.nan, _POSITION_M, 16)
     known = (steps >= 0) & (steps < horizon)
     points = forecasts.trajectories[objects, 0][:, steps[known]]
-    points = forecasts.map_from_ego.inverse().apply(points)
-    rows["point"][:, known] = _signed(points, _POSITION_M, 16)
+    rows["point"][:, known] = _signed(_in_ego(points, forecasts), _POSITION_M, 16)
     return rows.ravel()
+
+
+def _map_from_ego(forecasts: ForecastSet) -> Pose2:
+    """NaN if it is not known, and so is all that it is applied to."""
+    return forecasts.map_from_ego or Pose2(math.nan, math.nan, math.nan)
+
+
+def _in_ego(points: NDArray[np.float64], forecasts: ForecastSet) -> NDArray[np.float64]:
+    """Points (A, ..., 2) of the first A trajectories, map frame, as seen from the ego vehicle; NaN
+    where these say nothing.
+    """
+    moved = _map_from_ego(forecasts).inverse().apply(points)
+    moved[forecasts.is_standstill_assumed[: len(points)]] = np.nan
+    return moved
 
 
 def short_id(text: str) -> int:

@@ -8,6 +8,7 @@ closed port costs the same and fails nothing.
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -18,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import AddressError, UsageError, in_one_line
-from eqrt.core.frames import Pose2
-from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.forecasts import ForecastSet, Mode, pose_numbers, pose_of
 from eqrt.runtime.output.status import ServiceStatus
 
 FORMAT_VERSION = 2
@@ -154,7 +154,7 @@ class _Wire(msgspec.Struct, tag_field="kind", tag="forecast"):
     mode: int
     model_id: str
     tile_id: str
-    map_from_ego: tuple[float, float, float]  # x m, y m, yaw rad
+    map_from_ego: tuple[float, float, float]  # x m, y m, yaw rad; NaN = not known
     origin: tuple[float, float]  # m, map frame: positions count from here
     ego_speed_mps: float
     dt_s: float
@@ -174,6 +174,7 @@ class _Wire(msgspec.Struct, tag_field="kind", tag="forecast"):
     trajectories: bytes  # float32 (A, K, H, 2)
     probabilities: bytes  # float32 (A, K)
     covariances: bytes  # float32 (A, K, H, 2, 2), or empty
+    received_s: float = math.nan  # an older service does not tell
 
 
 _ENCODER = msgspec.msgpack.Encoder()
@@ -182,7 +183,8 @@ _DECODER = msgspec.msgpack.Decoder(_Wire | _StatusWire)
 
 def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
     pose = forecasts.map_from_ego
-    origin = (pose.x_m, pose.y_m)  # float32 is exact to 0.1 mm around the ego vehicle
+    # float32 is exact to 0.1 mm around the ego vehicle; where that is not known, nothing is sent
+    origin = (pose.x_m, pose.y_m) if pose is not None else (0.0, 0.0)
     some = forecasts.targets(rows)
     return _Wire(
         version=FORMAT_VERSION,
@@ -195,7 +197,7 @@ def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
         mode=int(some.mode),
         model_id=some.model_id,
         tile_id=some.tile_id,
-        map_from_ego=(pose.x_m, pose.y_m, pose.yaw_rad),
+        map_from_ego=pose_numbers(pose),
         origin=origin,
         ego_speed_mps=some.ego_speed_mps,
         dt_s=some.dt_s,
@@ -215,6 +217,7 @@ def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
         trajectories=_bytes(some.trajectories - origin),
         probabilities=_bytes(some.probabilities),
         covariances=b"" if some.covariances is None else _bytes(some.covariances),
+        received_s=some.received_s,
     )
 
 
@@ -229,12 +232,13 @@ def _forecasts(wire: _Wire) -> ForecastSet:
     return ForecastSet(
         cycle=wire.cycle,
         timestamp_s=wire.timestamp_s,
+        received_s=wire.received_s,
         made_s=wire.made_s,
         compute_s=wire.compute_s,
         mode=Mode(wire.mode),
         model_id=wire.model_id,
         tile_id=wire.tile_id,
-        map_from_ego=Pose2(*wire.map_from_ego),
+        map_from_ego=pose_of(wire.map_from_ego),
         ego_speed_mps=wire.ego_speed_mps,
         dt_s=wire.dt_s,
         track_id=np.frombuffer(wire.track_id, "<i8").reshape(agents),

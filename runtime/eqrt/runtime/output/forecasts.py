@@ -7,6 +7,7 @@ Map frame, metres, seconds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -33,7 +34,7 @@ class Mode(IntEnum):
     PARTIAL = 3
     """The target has been seen for less than the model's history."""
     LATE = 4
-    """Of a cycle: out later than one period after its input, or some of its targets are late.
+    """Of a cycle: made later than one period after `received_s`, or some of its targets are late.
 
     Of a target: there was no time for the model; constant turn rate and velocity instead.
     """
@@ -51,6 +52,8 @@ class ForecastSet:
     """Counts the cycles from 0, also those without targets."""
     timestamp_s: float
     """The newest measurement used; `map_from_ego` holds at this time."""
+    received_s: float
+    """When the cycle's last message came; NaN = nothing came (SILENT), or it is not told."""
     made_s: float
     """When the prediction was finished."""
     compute_s: float
@@ -60,7 +63,8 @@ class ForecastSet:
     """The first digits of the model file's sha256, hexadecimal; empty without a model."""
     tile_id: str
     """Likewise of the tile; empty without a map."""
-    map_from_ego: Pose2
+    map_from_ego: Pose2 | None
+    """None = not known: then nothing is predicted."""
     ego_speed_mps: float
     """Of the ego reference point over ground, backwards negative; NaN = not known."""
     dt_s: float
@@ -76,7 +80,9 @@ class ForecastSet:
     position: NDArray[np.float64]
     """(A, 2) at `anchor_s`."""
     velocity: NDArray[np.float64]
-    """(A, 2) m/s over ground at `anchor_s`, NaN = not known."""
+    """(A, 2) m/s over ground at `anchor_s`: from the last second of `history`; where that has fewer
+    than two steps as the sensor says, NaN = it does not.
+    """
     heading_rad: NDArray[np.float64]
     """(A,) as the sensor says, counter-clockwise from east, NaN = it does not."""
     object_class: NDArray[np.uint8]
@@ -106,11 +112,29 @@ class ForecastSet:
         """(A,) how old each target's last measurement was when the prediction was finished."""
         return self.made_s - self.anchor_s
 
+    @property
+    def is_standstill_assumed(self) -> NDArray[np.bool_]:
+        """(A,) physics was to predict the target, and its velocity is not known: `trajectories`
+        stay at `position`, which says nothing.
+        """
+        by_physics = np.isin(self.agent_mode, (Mode.LATE, Mode.FALLBACK))
+        return by_physics & np.isnan(self.velocity).any(axis=1)
+
     def targets(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> ForecastSet:
         """The same cycle with only some of its targets."""
         chosen = {name: getattr(self, name)[rows] for name in _OF_TARGETS}
         covariances = None if self.covariances is None else self.covariances[rows]
         return replace(self, covariances=covariances, **chosen)
+
+
+def pose_numbers(pose: Pose2 | None) -> tuple[float, float, float]:
+    """A pose as formats have it: x and y in m, yaw in rad, all NaN = not known."""
+    return (pose.x_m, pose.y_m, pose.yaw_rad) if pose is not None else (math.nan,) * 3
+
+
+def pose_of(numbers: tuple[float, float, float]) -> Pose2 | None:
+    """The pose that `pose_numbers` wrote."""
+    return None if any(map(math.isnan, numbers)) else Pose2(*numbers)
 
 
 _OF_TARGETS = (

@@ -88,8 +88,10 @@ def check_base_id(base_id: int) -> None:
 
 
 def nearest_first(forecasts: ForecastSet) -> ForecastSet:
-    """The same cycle, its targets by their distance from the ego vehicle."""
+    """The same cycle, its targets by their distance from the ego vehicle, if that is known."""
     ego = forecasts.map_from_ego
+    if ego is None:
+        return forecasts
     offset = forecasts.position - (ego.x_m, ego.y_m)
     return forecasts.targets(np.argsort(np.hypot(offset[:, 0], offset[:, 1]), kind="stable"))
 

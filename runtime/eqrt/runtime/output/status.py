@@ -65,5 +65,9 @@ class ServiceStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Of the newest cycle: tracks, scene, infer, guard."""
     totals: dict[str, int]
     """Counts since the start, by name: docs/output.md."""
+    ego_known: bool = True
+    """How the ego vehicle moves was known for the newest cycle: without, nothing is predicted.
+    False in SILENT.
+    """
     buses: list[BusStatus] = []
     sources: list[SourceStatus] = []

@@ -1,8 +1,9 @@
 """The last check before a prediction leaves: finite, continuous and physically possible.
 
 A target whose prediction fails falls back to constant turn rate and velocity (CTRV) from its own
-history, alone, and says so. So does a target that the model said nothing about (NaN). The limits
-are wide: they catch a broken model, not a bold one.
+history, alone, and says so. So does a target that the model said nothing about (NaN). A history of
+one step has no velocity: that is the one that the sensor measured, or is not known. The limits are
+wide: they catch a broken model, not a bold one.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Guarded:
     accepted: Bool
     """(B,) False: this target fell back to CTRV."""
     velocity: Float64
-    """(B, 2) m/s, fitted to the history."""
+    """(B, 2) m/s, fitted to the history, else as measured; NaN = not known."""
 
 
 def guard(
@@ -86,13 +87,16 @@ def guard(
     dt_s: float,
     *,
     object_class: NDArray[np.uint8] | None = None,
+    measured: Float64 | None = None,
     covariances: Float64 | None = None,
 ) -> Guarded:
     """Check trajectories (B, K, H, 2) against the targets' own histories (B, T, 2), map frame.
 
-    The last step of every history must be valid. `object_class` (B,): None = unknown.
+    The last step of every history must be valid. `object_class` (B,): None = unknown. `measured`:
+    velocities (B, 2) in m/s over ground as the sensor says, NaN or None = it does not.
     """
-    velocity, turn_rate = fit_motion(history, valid, dt_s)
+    fitted, turn_rate = fit_motion(history, valid, dt_s)
+    velocity = fitted if measured is None else _else_measured(fitted, measured)
     position = history[:, -1]
     known = np.zeros(len(history), np.uint8) if object_class is None else object_class
     accepted = _finite(trajectories, probabilities, covariances)
@@ -114,6 +118,12 @@ def guard(
     )
 
 
+def _else_measured(fitted: Float64, measured: Float64) -> Float64:
+    """Velocities (B, 2), those that are NaN as measured, unless nothing is so fast."""
+    possible = np.linalg.norm(measured, axis=1, keepdims=True) <= MAX_SPEED_MPS
+    return np.where(np.isnan(fitted) & possible, measured, fitted)
+
+
 def _finite(trajectories: Float64, probabilities: Float64, covariances: Float64 | None) -> Bool:
     """(B,) numbers, probabilities that are none below zero and sum to one."""
     finite = np.isfinite(trajectories).all(axis=(1, 2, 3))
@@ -128,6 +138,7 @@ def _possible(
     path: Float64, position: Float64, velocity: Float64, dt_s: float, known: NDArray[np.uint8]
 ) -> Bool:
     """(B,) whether every mode of a target is continuous and within its class's limits."""
+    velocity = np.where(np.isnan(velocity), 0.0, velocity)
     first_m = np.linalg.norm(path[:, :, 0] - (position + velocity * dt_s)[:, None], axis=-1)
     step = np.diff(path, axis=2) / dt_s  # (B, K, H - 1, 2) m/s
     rows = _TABLE[np.minimum(known, len(_TABLE) - 1)]

@@ -22,6 +22,8 @@ class Targets:
     track_id: NDArray[np.int64]
     object_id: NDArray[np.int64]
     anchor_s: Float64
+    velocity: Float64
+    """(B, 2) m/s over ground as measured."""
     heading_rad: Float64
     object_class: NDArray[np.uint8]
     length_m: Float64
@@ -38,6 +40,7 @@ class Targets:
             track_id=tracks.track_id[rows],
             object_id=tracks.object_id[rows],
             anchor_s=tracks.timestamp_s[rows],
+            velocity=tracks.velocity[rows],
             heading_rad=tracks.heading_rad[rows],
             object_class=tracks.object_class[rows],
             length_m=tracks.length_m[rows],
@@ -53,6 +56,7 @@ class Targets:
             track_id=np.zeros(0, np.int64),
             object_id=np.zeros(0, np.int64),
             anchor_s=np.zeros(0),
+            velocity=np.zeros((0, 2)),
             heading_rad=np.zeros(0),
             object_class=np.zeros(0, np.uint8),
             length_m=np.zeros(0),

@@ -114,13 +114,15 @@ class Watched:
     def run(self, scene: Scene, patience_s: float) -> Prediction:
         """Predict within `patience_s`.
 
-        Raises TooLate if that is over before, Failed if the model raises or is still at work on an
-        earlier scene.
+        Raises TooLate if that is over before, or the model is still at work on an earlier scene;
+        Failed if it raises, or has been at work for so long that it is stuck.
         """
         now_s = self._clock()
         self._replace_if_broken(now_s)
+        if self._is_stuck(now_s):
+            raise Failed(f"the model has been at work for more than {STUCK_S:g} s")
         if self._worker.busy_since_s() is not None:
-            raise Failed("the model is still at work on an earlier scene")
+            raise TooLate("the model is still at work on an earlier scene")
         answer = self._worker.ask(scene, patience_s, now_s)
         if answer is None:
             self.overruns += 1
@@ -147,12 +149,15 @@ class Watched:
                 self._worker, self._errors_in_a_row = _Worker(self._successor.model), 0
                 self.restarts += 1
             self._successor = None
-        since_s = self._worker.busy_since_s()
-        is_stuck = since_s is not None and now_s - since_s > STUCK_S
-        if (is_stuck or self._errors_in_a_row >= MAX_ERRORS) and now_s >= self._next_restart_s:
+        is_broken = self._is_stuck(now_s) or self._errors_in_a_row >= MAX_ERRORS
+        if is_broken and now_s >= self._next_restart_s:
             self._next_restart_s = now_s + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
             self._successor = _Successor(self._model)
+
+    def _is_stuck(self, now_s: float) -> bool:
+        since_s = self._worker.busy_since_s()
+        return since_s is not None and now_s - since_s > STUCK_S
 
 
 Counting = TypeVar("Counting", Direct, Watched)

@@ -7,6 +7,7 @@ recording must tell whether a replay came out the same.
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from typing import Annotated, Any
 
@@ -15,8 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from eqrt.core.errors import in_one_line
-from eqrt.core.frames import Pose2
-from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.output.forecasts import ForecastSet, Mode, pose_numbers, pose_of
 
 _NAMES = tuple(field.name for field in fields(ForecastSet))
 _TYPES = frozenset({"<f8", "<f4", "<i8", "|u1", "|b1"})
@@ -35,7 +35,7 @@ class _Wire(msgspec.Struct):
     model_id: str
     tile_id: str
     map_from_ego: tuple[float, float, float]
-    """x m, y m, yaw rad"""
+    """x m, y m, yaw rad; NaN = not known"""
     ego_speed_mps: float
     dt_s: float
     track_id: _Array
@@ -53,6 +53,8 @@ class _Wire(msgspec.Struct):
     trajectories: _Array
     probabilities: _Array
     covariances: _Array | None = None
+    received_s: float = math.nan
+    """Older recordings do not tell."""
 
 
 MAX_VALUE = 1e12
@@ -74,7 +76,8 @@ _DECODER = msgspec.msgpack.Decoder(_Wire)
 
 def encode_forecasts(forecasts: ForecastSet) -> bytes:
     """The bytes of one cycle."""
-    return _ENCODER.encode({name: _plain(getattr(forecasts, name)) for name in _NAMES})
+    plain = {name: _plain(getattr(forecasts, name)) for name in _NAMES}
+    return _ENCODER.encode(plain | {"map_from_ego": pose_numbers(forecasts.map_from_ego)})
 
 
 def decode_forecasts(payload: bytes) -> ForecastSet:
@@ -84,7 +87,7 @@ def decode_forecasts(payload: bytes) -> ForecastSet:
         values: dict[str, Any] = {name: getattr(wire, name) for name in _NAMES}
         values |= {name: _array(*values[name]) for name in _AXES if values[name] is not None}
         values["mode"] = Mode(wire.mode)
-        values["map_from_ego"] = Pose2(*wire.map_from_ego)
+        values["map_from_ego"] = pose_of(wire.map_from_ego)
         _check(values)
         return ForecastSet(**values)
     except (msgspec.MsgspecError, RecursionError, TypeError, ValueError) as error:
@@ -96,8 +99,6 @@ def decode_forecasts(payload: bytes) -> ForecastSet:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return (value.dtype.str, value.shape, value.tobytes())
-    if isinstance(value, Pose2):
-        return (value.x_m, value.y_m, value.yaw_rad)
     return int(value) if isinstance(value, Mode) else value
 
 

@@ -19,9 +19,9 @@ class Outcome(IntEnum):
 
     ANSWERED = 0
     FAILED = 1
-    """The model raised an error, or was still at work on an earlier scene."""
+    """The model raised an error, or was stuck."""
     GIVEN_UP = 2
-    """Its time was over."""
+    """Its time was over, or the model still at work on an earlier scene."""
 
 
 class RunTape:

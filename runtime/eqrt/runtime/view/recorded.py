@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import LogError, in_one_line
-from eqrt.core.frames import Pose2
 from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import Line
@@ -101,12 +100,13 @@ def _forecast(
         return ForecastSet(
             cycle=first.cycle,
             timestamp_s=first.time_s,
+            received_s=math.nan,
             made_s=first.time_s,
             compute_s=0.0,
             mode=Mode[first.cycle_mode],
             model_id=first.model_id,
             tile_id=first.tile_id,
-            map_from_ego=Pose2(),
+            map_from_ego=None,
             ego_speed_mps=math.nan,
             dt_s=first.dt_s,
             track_id=np.array([line.track_id for line in lines]),

@@ -22,6 +22,7 @@ from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.view.hindsight import LOOK_BACK_S, Ghosts, Score
 from eqrt.runtime.view.words import (
     AGENT_LEVELS,
+    AGENT_STANDS,
     AGENT_WORDS,
     GOOD,
     LEVELS,
@@ -228,20 +229,28 @@ def is_on_map(forecast: ForecastSet) -> bool:
 
 
 def ego_pose(forecast: ForecastSet) -> tuple[float, float, float] | None:
-    """x, y in m and yaw in rad in the map frame; a cycle that knows no speed knows no pose."""
+    """x, y in m and yaw in rad in the map frame; None = not known.
+
+    Older recordings have a pose of zeros there, but no speed.
+    """
     pose = forecast.map_from_ego
-    known = not math.isnan(forecast.ego_speed_mps)
-    return (pose.x_m, pose.y_m, pose.yaw_rad) if known else None
+    if pose is None or math.isnan(forecast.ego_speed_mps):
+        return None
+    return pose.x_m, pose.y_m, pose.yaw_rad
 
 
 def _agents(forecast: ForecastSet, ghosts: Ghosts) -> Agents:
     modes = [Mode(number) for number in forecast.agent_mode.tolist()]
+    stands = forecast.is_standstill_assumed.tolist()
     ego = ego_pose(forecast) or (math.nan, math.nan)
     return Agents(
         track_id=forecast.track_id.tolist(),
         object_id=forecast.object_id.tolist(),
         kind=[class_words(number) for number in forecast.object_class.tolist()],
-        words=[AGENT_WORDS.get(mode, mode.name) for mode in modes],
+        words=[
+            AGENT_STANDS if stands[row] else AGENT_WORDS.get(mode, mode.name)
+            for row, mode in enumerate(modes)
+        ],
         level=[AGENT_LEVELS.get(mode, GOOD) for mode in modes],
         age_s=_rounded(forecast.age_s, 3),
         range_m=_rounded(np.linalg.norm(forecast.position - ego[:2], axis=-1), 1),

@@ -35,6 +35,8 @@ AGENT_WORDS = {
     Mode.LATE: "at constant turn rate and speed: no time for the model",
     Mode.FALLBACK: "at constant turn rate and speed: the model failed",
 }
+AGENT_STANDS = "not predicted: nothing tells how it moves"
+"""Of a target that physics leaves where it was seen (`ForecastSet.is_standstill_assumed`)."""
 AGENT_BRIEF = {
     Mode.RUN: "full history",
     Mode.PARTIAL: "short history",
