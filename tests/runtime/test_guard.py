@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 from eqrt.core.kinematics import constant_turn
 from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.prediction.forecaster import Raw
-from eqrt.runtime.prediction.guard import LIMITS, MAX_GAIN_MPS, START_M, Guarded, guard
+from eqrt.runtime.prediction.guard import (
+    LIMITS,
+    MAX_GAIN_MPS,
+    MIN_STEPS,
+    START_M,
+    Guarded,
+    guard,
+)
 from raw_predictions import AHEAD_S, DT_S, STEPS, driving
 
 Float64 = NDArray[np.float64]
@@ -172,21 +179,39 @@ def test_without_a_sensor_that_measures_velocities_a_target_seen_once_has_none()
     assert np.isnan(found.velocity).all()
 
 
+@pytest.mark.parametrize("steps", [1, 2, MIN_STEPS - 1])
+def test_a_target_that_was_just_found_goes_by_what_was_measured(steps: int) -> None:
+    """The model has its say where nothing was measured, once there are two steps."""
+    raw = driving(targets=2)
+    raw.targets.velocity[:] = [(-25.0, 3.0), (np.nan, np.nan)]
+    raw.targets.valid[:, :-steps] = False
+    raw.targets.history[:, :-steps] = np.nan
+    found = guarded(raw)
+    assert found.accepted.all()
+    np.testing.assert_array_equal(found.velocity[0], [-25.0, 3.0])
+    np.testing.assert_allclose(found.trajectories[0, 0], np.outer(AHEAD_S, [-25.0, 3.0]))
+    np.testing.assert_array_equal(found.probabilities[0], [1.0, 0.0])
+    if steps == 1:
+        assert np.isnan(found.velocity[1]).all()
+        np.testing.assert_array_equal(found.trajectories[1], 0.0)
+    else:
+        np.testing.assert_allclose(found.velocity[1], [12.0, 0.0])
+        np.testing.assert_array_equal(found.trajectories[1], raw.trajectories[1])
+
+
 def test_what_was_measured_does_not_replace_what_the_history_tells() -> None:
     raw = driving()
     raw.targets.velocity[:] = (-25.0, 3.0)
-    raw.targets.valid[:, :-2] = False
-    np.testing.assert_allclose(guarded(raw).velocity, [[12.0, 0.0]])
-
-
-def test_the_model_may_not_contradict_what_was_measured_of_a_target_seen_once() -> None:
-    """It starts as the sensor says, to 2 m; where that says nothing, where the target is."""
-    raw = seen_once((-25.0, 0.0), (-15.0, 0.0), (np.nan, np.nan))
-    raw.trajectories[:] = 0.0
+    raw.targets.valid[:, :-MIN_STEPS] = False
     found = guarded(raw)
-    np.testing.assert_array_equal(found.accepted, [False, True, True])
-    np.testing.assert_allclose(found.trajectories[0, 0, -1], [-75.0, 0.0])
-    assert np.isnan(found.velocity[2]).all()
+    np.testing.assert_allclose(found.velocity, [[12.0, 0.0]])
+    np.testing.assert_array_equal(found.trajectories, raw.trajectories)
+
+
+def test_a_model_that_fails_is_said_to_have_failed_of_what_was_just_found_too() -> None:
+    raw = seen_once((-25.0, 0.0))
+    raw.trajectories[:] = np.nan
+    assert not guarded(raw).accepted.any()
 
 
 # --- what each class can do

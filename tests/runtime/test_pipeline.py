@@ -29,6 +29,7 @@ from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.pipeline import Pipeline
+from eqrt.runtime.prediction.guard import MIN_STEPS
 from eqrt.runtime.prediction.predictor import Prediction
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.prediction.watched import Model
@@ -432,7 +433,8 @@ def test_an_impossible_prediction_is_replaced_and_marked(value: float) -> None:
         assert last.mode is mode
         fell_back = last.agent_mode == Mode.FALLBACK
         np.testing.assert_array_equal(np.flatnonzero(fell_back), np.arange(3)[rows])
-        assert pipeline.counters.fallbacks == 21 * fell_back.sum()
+        asked = 21 if not np.isfinite(value) else 21 - (MIN_STEPS - 1)  # not of what is just found
+        assert pipeline.counters.fallbacks == asked * fell_back.sum()
         end = last.position + 3.0 * last.velocity
         np.testing.assert_allclose(last.trajectories[1, 0, -1], end[1], atol=0.2)
 
@@ -475,7 +477,7 @@ def test_a_car_that_was_seen_once_goes_on_though_there_is_no_time_for_the_model(
 def test_of_what_was_seen_once_by_a_sensor_that_measures_no_velocity_none_is_known(
     tmp_path: Path, *, fails: bool
 ) -> None:
-    """Only the model can say where it goes. From the second cycle on there is a velocity."""
+    """Nobody can say where it goes. From the second cycle on there is a velocity."""
     model = Raising({0, 1} if fails else ())
     pipeline = Pipeline(profile_of(tmp_path, COUNTED), model)
     made = []
@@ -484,7 +486,7 @@ def test_of_what_was_seen_once_by_a_sensor_that_measures_no_velocity_none_is_kno
             made += pipeline.feed(message, step / 10)
     made += pipeline.finish(0.1)
     assert np.isnan(made[0].velocity).all()
-    assert made[0].is_standstill_assumed.tolist() == [fails]
+    assert made[0].is_standstill_assumed.tolist() == [True]
     np.testing.assert_allclose(made[1].velocity, [[-10.0, 0.0]], atol=0.1)
     assert made[1].is_standstill_assumed.tolist() == [False]
 

@@ -216,50 +216,34 @@ def test_more_modes_come_best_first(database: Database) -> None:
 
 
 def test_what_is_not_known_is_marked_not_available(fd: Wire) -> None:
-    """No velocity, a horizon of 2 s instead of 3, a point beyond 655.34 m, no id of the sensor."""
+    """A horizon of 2 s instead of 3, a point beyond 655.34 m, no id of the sensor."""
     forecasts = one_car()
     trajectories = forecasts.trajectories[:, :, :20].copy()
     trajectories[0, 0, 1] = (100.0, 1200.0)
     forecasts = replace(
         forecasts,
-        velocity=np.full((1, 2), np.nan),
         trajectories=trajectories,
         object_id=np.array([-1]),
     )
     _, (_, car) = fd.decoded(forecasts)
     assert car["PointStep"] == 200
-    assert car["VelocityX"] == car["VelocityY"] == car["ObjectId"] == NOT_AVAILABLE
+    assert car["ObjectId"] == NOT_AVAILABLE
     assert car["X1"] == NOT_AVAILABLE
     assert car["Y1"] == 0.0
     assert car["X10"] == pytest.approx(40.0)
 
 
-@pytest.mark.parametrize("mode", [Mode.LATE, Mode.FALLBACK])
-def test_physics_without_a_velocity_gives_no_points(fd: Wire, classic: Wire, mode: Mode) -> None:
-    """It would be sent as standing; where it is, is known. The model needs no velocity."""
+def test_without_a_velocity_there_are_no_points(fd: Wire, classic: Wire) -> None:
+    """It would be sent as standing; where it is, is known."""
     unknown = replace(one_car(), velocity=np.full((1, 2), np.nan))
-    by_physics = replace(unknown, agent_mode=np.array([mode], np.uint8))
-    _, (_, car) = fd.decoded(by_physics)
-    assert {car[f"{axis}{i}"] for axis in "XY" for i in range(1, 11)} == {NOT_AVAILABLE}
-    assert car["PositionX"] == pytest.approx(20.0)
-    points = [values for name, values in classic.decoded(by_physics) if "Point" in name]
-    assert {point[axis] for point in points for axis in "XY"} == {NOT_AVAILABLE}
     _, (_, car) = fd.decoded(unknown)
+    assert {car[f"{axis}{i}"] for axis in "XY" for i in range(1, 11)} == {NOT_AVAILABLE}
+    assert car["VelocityX"] == car["VelocityY"] == NOT_AVAILABLE
+    assert car["PositionX"] == pytest.approx(20.0)
+    points = [values for name, values in classic.decoded(unknown) if "Point" in name]
+    assert {point[axis] for point in points for axis in "XY"} == {NOT_AVAILABLE}
+    _, (_, car) = fd.decoded(one_car())
     assert car["X10"] == pytest.approx(50.0)
-    _, (_, car) = fd.decoded(replace(one_car(), agent_mode=by_physics.agent_mode))
-    assert car["X10"] == pytest.approx(50.0)
-
-
-def test_points_beyond_the_horizon_are_not_available(fd: Wire, classic: Wire) -> None:
-    """Half a second of forecast fills five points of 0.1 s, and no whole second."""
-    forecasts = one_car()
-    forecasts = replace(forecasts, trajectories=forecasts.trajectories[:, :, :5])
-    _, (_, car) = fd.decoded(forecasts)
-    assert car["PointStep"] == 100
-    assert [car[f"X{i}"] for i in range(1, 6)] == pytest.approx([21.0, 22.0, 23.0, 24.0, 25.0])
-    assert {car[f"{axis}{i}"] for axis in "XY" for i in range(6, 11)} == {NOT_AVAILABLE}
-    points = [values["X"] for name, values in classic.decoded(forecasts) if "Point" in name]
-    assert points == [NOT_AVAILABLE] * 3
 
 
 def test_where_the_ego_vehicle_is_not_known_so_is_all_that_is_seen_from_it(
@@ -428,7 +412,7 @@ def test_what_a_full_bus_refuses_is_sent_when_there_is_room(is_fd: bool) -> None
     assert len(heard) == 10
     begun_s = now_s = time.monotonic()
     while (left_s := outbox.push(now_s)) < np.inf:
-        assert 0.0 < left_s <= AGAIN_S
+        assert 0.0 < left_s <= AGAIN_S + 1e-6
         heard += bus.read()
         now_s += left_s
     heard += bus.read()

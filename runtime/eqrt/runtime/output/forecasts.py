@@ -80,8 +80,8 @@ class ForecastSet:
     position: NDArray[np.float64]
     """(A, 2) at `anchor_s`."""
     velocity: NDArray[np.float64]
-    """(A, 2) m/s over ground at `anchor_s`: from the last second of `history`; where that has fewer
-    than two steps as the sensor says, NaN = it does not.
+    """(A, 2) m/s over ground at `anchor_s`: from the last second of `history`; where that has few
+    steps as the sensor says, NaN = neither tells.
     """
     heading_rad: NDArray[np.float64]
     """(A,) as the sensor says, counter-clockwise from east, NaN = it does not."""
@@ -114,11 +114,10 @@ class ForecastSet:
 
     @property
     def is_standstill_assumed(self) -> NDArray[np.bool_]:
-        """(A,) physics was to predict the target, and its velocity is not known: `trajectories`
-        stay at `position`, which says nothing.
+        """(A,) the target was just found, and its velocity is not known: `trajectories` stay at
+        `position`, which says nothing.
         """
-        by_physics = np.isin(self.agent_mode, (Mode.LATE, Mode.FALLBACK))
-        return by_physics & np.isnan(self.velocity).any(axis=1)
+        return np.isnan(self.velocity).any(axis=1)
 
     def targets(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> ForecastSet:
         """The same cycle with only some of its targets."""

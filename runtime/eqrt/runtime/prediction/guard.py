@@ -1,9 +1,12 @@
 """The last check before a prediction leaves: finite, continuous and physically possible.
 
 A target whose prediction fails falls back to constant turn rate and velocity (CTRV) from its own
-history, alone, and says so. So does a target that the model said nothing about (NaN). A history of
-one step has no velocity: that is the one that the sensor measured, or is not known. The limits are
-wide: they catch a broken model, not a bold one.
+history, alone, and says so. So does a target that the model said nothing about (NaN). The limits
+are wide: they catch a broken model, not a bold one.
+
+A target that was just found goes by the velocity that the sensor measured: what the model, or a
+fit, makes of so few steps is worse (docs/results.md). Where none is measured, the model has its say
+from the second step on, and before that nothing is known.
 """
 
 from __future__ import annotations
@@ -13,12 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.core.kinematics import constant_turn, fit_motion
+from eqrt.core.kinematics import FIT_STEPS, constant_turn, fit_motion
 from eqrt.runtime.decoding.detections import ObjectClass
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+MIN_STEPS = 4
+"""Steps in the last second from which on a history says more than a measured velocity."""
 START_M = 2.0
 """How far the first step may lie from where the target is and was going."""
 WINDOW_STEPS = 5
@@ -76,7 +81,9 @@ class Guarded:
     accepted: Bool
     """(B,) False: this target fell back to CTRV."""
     velocity: Float64
-    """(B, 2) m/s, fitted to the history, else as measured; NaN = not known."""
+    """(B, 2) m/s, fitted to the history, or as measured; NaN = not known, and `trajectories` stay
+    where the target is.
+    """
 
 
 def guard(
@@ -95,33 +102,38 @@ def guard(
     The last step of every history must be valid. `object_class` (B,): None = unknown. `measured`:
     velocities (B, 2) in m/s over ground as the sensor says, NaN or None = it does not.
     """
-    fitted, turn_rate = fit_motion(history, valid, dt_s)
-    velocity = fitted if measured is None else _else_measured(fitted, measured)
+    velocity, turn_rate = fit_motion(history, valid, dt_s)
+    found, velocity = _just_found(velocity, measured, valid)
     position = history[:, -1]
     known = np.zeros(len(history), np.uint8) if object_class is None else object_class
     accepted = _finite(trajectories, probabilities, covariances)
     path = np.where(accepted[:, None, None, None], trajectories, position[:, None, None])
-    accepted &= _possible(path, position, velocity, dt_s, known)
-    if accepted.all():
+    accepted &= found | _possible(path, position, velocity, dt_s, known)
+    by_model = accepted & ~found
+    if by_model.all():
         return Guarded(trajectories, probabilities, covariances, accepted, velocity)
     course = constant_turn(position, velocity, turn_rate, trajectories.shape[2], dt_s)
     certain = np.zeros_like(probabilities)
     certain[:, 0] = 1.0
     if covariances is not None:
-        covariances = np.where(accepted[:, None, None, None, None], covariances, np.nan)
+        covariances = np.where(by_model[:, None, None, None, None], covariances, np.nan)
     return Guarded(
-        np.where(accepted[:, None, None, None], trajectories, course[:, None]),
-        np.where(accepted[:, None], probabilities, certain),
+        np.where(by_model[:, None, None, None], trajectories, course[:, None]),
+        np.where(by_model[:, None], probabilities, certain),
         covariances,
         accepted,
         velocity,
     )
 
 
-def _else_measured(fitted: Float64, measured: Float64) -> Float64:
-    """Velocities (B, 2), those that are NaN as measured, unless nothing is so fast."""
-    possible = np.linalg.norm(measured, axis=1, keepdims=True) <= MAX_SPEED_MPS
-    return np.where(np.isnan(fitted) & possible, measured, fitted)
+def _just_found(fitted: Float64, measured: Float64 | None, valid: Bool) -> tuple[Bool, Float64]:
+    """(B,) which targets the model is not asked about yet, and the velocities (B, 2) of all."""
+    unfitted = np.isnan(fitted[:, 0])
+    if measured is None:
+        return unfitted, fitted
+    is_measured = np.linalg.norm(measured, axis=1) <= MAX_SPEED_MPS  # no for NaN
+    found = unfitted | (is_measured & (valid[:, -FIT_STEPS:].sum(axis=1) < MIN_STEPS))
+    return found, np.where((found & is_measured)[:, None], measured, fitted)
 
 
 def _finite(trajectories: Float64, probabilities: Float64, covariances: Float64 | None) -> Bool:
@@ -138,7 +150,6 @@ def _possible(
     path: Float64, position: Float64, velocity: Float64, dt_s: float, known: NDArray[np.uint8]
 ) -> Bool:
     """(B,) whether every mode of a target is continuous and within its class's limits."""
-    velocity = np.where(np.isnan(velocity), 0.0, velocity)
     first_m = np.linalg.norm(path[:, :, 0] - (position + velocity * dt_s)[:, None], axis=-1)
     step = np.diff(path, axis=2) / dt_s  # (B, K, H - 1, 2) m/s
     rows = _TABLE[np.minimum(known, len(_TABLE) - 1)]
