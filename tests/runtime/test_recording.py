@@ -35,17 +35,10 @@ from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Step, TapedClock
 from eqrt.runtime.service import Service
-from processes import PATIENCE_S, Heard, Serving, eqrt
+from processes import PATIENCE_S, Heard, eqrt
 from recorded_drives import CHANNELS, patiently, recorded_drive
 
 PLAY = ("--can", "nowhere", "--can-interface", LOCAL)
-
-
-def writer_of(service: Serving) -> int:
-    """The process that writes for it."""
-    children = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
-    assert len(children) == 1
-    return int(children[0])
 
 
 def said(recording: Recording) -> bytes:
@@ -177,7 +170,7 @@ def test_what_was_recorded_before_a_kill_is_there_up_to_the_last_second(tmp_path
     """Service and writer killed at once, while predictions are made."""
     folder, log = tmp_path / "rec", tmp_path / "drive.log"
     with recorded_drive("ngsim", folder, log, until=25) as (service, heard):
-        writer = writer_of(service)
+        writer = service.writer_pid()
         os.kill(service.pid, signal.SIGKILL)
         os.kill(writer, signal.SIGKILL)
         killed_ns = time.time_ns()
@@ -209,7 +202,7 @@ def newest_by_the_library(file: Path) -> int:
 def test_predictions_go_on_when_the_writer_is_killed(tmp_path: Path) -> None:
     folder, log = tmp_path / "rec", tmp_path / "drive.log"
     with recorded_drive("ngsim", folder, log, seconds=1.0) as (service, heard):
-        os.kill(writer_of(service), signal.SIGKILL)
+        os.kill(service.writer_pid(), signal.SIGKILL)
         cycles = len(heard.forecasts)
         patiently(lambda: heard.statuses[-1].totals["recording_ended"] == 1)
         patiently(lambda: len(heard.forecasts) > cycles + 5)  # it says SILENT, ten times a second
@@ -223,7 +216,7 @@ def test_the_writer_ends_after_a_service_that_was_killed(tmp_path: Path) -> None
     """And finishes the file: it is not cut."""
     folder, log = tmp_path / "rec", tmp_path / "drive.log"
     with recorded_drive("ngsim", folder, log, seconds=1.0) as (service, _):
-        writer = writer_of(service)
+        writer = service.writer_pid()
         service.end(signal.SIGKILL)
         patiently(lambda: not Path(f"/proc/{writer}").exists())
     (recording,) = read_recordings(folder)

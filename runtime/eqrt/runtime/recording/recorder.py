@@ -20,6 +20,7 @@ import can
 import msgspec
 
 from eqrt.core.errors import RecordingError
+from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.exact_forecasts import encode_forecasts
@@ -160,11 +161,9 @@ class Recorder:
         code = self._writer.poll()
         if code is not None and code < 0 and not self._is_said:
             self._is_said = True
-            print(
-                f"eqrt serve: recording ended: its writer was killed ({signal.Signals(-code).name})"
-                "; predictions go on",
-                file=sys.stderr,
-                flush=True,
+            name = signal.Signals(-code).name
+            Outlet(sys.stderr).put(
+                f"eqrt serve: recording ended: its writer was killed ({name}); predictions go on"
             )
 
     def _is_described(self) -> bool:

@@ -1,6 +1,6 @@
 """What stands in a recording: its topics, and how their messages are written (docs/recording.md).
 
-The recorder and its writer, which is another process and imports nothing but this and the writer's
+The recorder and its writer, which is another process and imports little but this and the writer's
 library, share this table.
 """
 
