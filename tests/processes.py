@@ -113,10 +113,8 @@ class Serving:
         self._process.send_signal(number)
 
     def wait(self) -> int:
-        """Its exit status; nothing of what it says is read before it has ended."""
-        status = self._process.wait(PATIENCE_S)
-        self._process.communicate()
-        return status
+        """Its exit status, without reading anything of what it says; `end` does that."""
+        return self._process.wait(PATIENCE_S)
 
     def end(self, by: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
         """Tell it to end: exit status, the rest of its output, its errors."""

@@ -342,6 +342,14 @@ def recorder_killed_unheard(world: World) -> Iterator[str]:
 
 
 @contextlib.contextmanager
+def disk_stands_still(world: World) -> Iterator[str]:
+    """Whoever writes to it stands still with it."""
+    os.kill(world.service.writer_pid, signal.SIGSTOP)
+    yield "1 SIGSTOP of the recorder"
+    os.kill(world.service.writer_pid, signal.SIGCONT)
+
+
+@contextlib.contextmanager
 def disk_fills_up(world: World) -> Iterator[str]:
     """The recording has a file system of its own, which it fills by itself."""
     yield "256 kB of room"
@@ -463,6 +471,7 @@ FAULTS: dict[str, tuple[float, Fault, Callable[[str, Heard], AbstractContextMana
     ),
     "nobody reads the log": (3.0, log_not_read, served_talking),
     "the log's reader goes away": (3.0, log_reader_gone, served_talking),
+    "the disk stands still for 3 s": (3.0, disk_stands_still, served_and_recorded),
     "the disk fills up": (6.0, disk_fills_up, served_and_recorded_into_little_room),
 }
 

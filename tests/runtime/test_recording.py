@@ -37,6 +37,7 @@ from eqrt.runtime.recording.steps import Step, TapedClock
 from eqrt.runtime.service import Service
 from processes import PATIENCE_S, Heard, eqrt
 from recorded_drives import CHANNELS, patiently, recorded_drive
+from source_tree import ROOT
 
 PLAY = ("--can", "nowhere", "--can-interface", LOCAL)
 
@@ -219,6 +220,37 @@ def test_the_writer_ends_after_a_service_that_was_killed(tmp_path: Path) -> None
         writer = service.writer_pid()
         service.end(signal.SIGKILL)
         patiently(lambda: not Path(f"/proc/{writer}").exists())
+    (recording,) = read_recordings(folder)
+    assert list(recording.forecasts())
+    assert recording.remark is None
+
+
+# --- a disk that stands still
+
+
+def test_a_service_ends_in_time_while_its_disk_stands_still(tmp_path: Path) -> None:
+    """In less than systemd allows it, and with a second to spare; its writer goes on until all is
+    written that the pipe has taken.
+    """
+    unit = (ROOT / "deploy/eqrt.service").read_text(encoding="utf-8")
+    allowed_s = float(unit.partition("TimeoutStopSec=")[2].split()[0])
+    folder, log = tmp_path / "rec", tmp_path / "drive.log"
+    with recorded_drive("ngsim", folder, log, until=3) as (service, heard):
+        writer = service.writer_pid()
+        os.kill(writer, signal.SIGSTOP)
+        try:
+            patiently(lambda: len(heard.forecasts) >= 35)
+            told_s = time.monotonic()
+            service.send(signal.SIGTERM)
+            status = service.wait()
+            ended_s = time.monotonic()
+        finally:
+            os.kill(writer, signal.SIGCONT)
+        assert status == 0
+        assert ended_s - told_s < allowed_s - 1.0
+        patiently(lambda: not Path(f"/proc/{writer}").exists())
+        _, stdout, _ = service.end()
+    assert stdout.splitlines()[-1].startswith("eqrt serve: ")
     (recording,) = read_recordings(folder)
     assert list(recording.forecasts())
     assert recording.remark is None

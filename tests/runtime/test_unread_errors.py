@@ -44,6 +44,7 @@ def test_a_service_goes_on_when_its_writer_is_killed_and_ends_when_told_to(
         patiently(lambda: len(heard.statuses) > seconds + 1)
         service.send(signal.SIGTERM)
         assert service.wait() == 0
+        service.end()
 
 
 def is_ended(heard: Heard) -> bool:
