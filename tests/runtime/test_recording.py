@@ -521,18 +521,6 @@ def test_another_file_is_an_error_in_one_line(
         assert said.count("\n") == 1
 
 
-def test_a_file_in_a_recording_cannot_lead_elsewhere(tmp_path: Path) -> None:
-    pipeline = Pipeline(load_profile("generic"), shipped_predictor())
-    identity = identity_of(pipeline, model_folder=Path("x"), channels=None, stationary=False)
-    evil = Attached("../../evil", "text/plain", b"x")
-    clock = TapedClock(time.monotonic)
-    with Recorder(order(tmp_path, identity, evil), clock, RunTape()) as recorder:
-        recorder.begin(None, 1.0)
-        recorder.end()
-    with pytest.raises(LogError, match="leads elsewhere"):
-        replayed(tmp_path)
-
-
 def test_a_model_that_is_gone_is_asked_for(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,8 @@ FORMAT_VERSION = 1
 IDENTITY = "eqrt"
 """Name of the metadata record that says what the recording is of."""
 PROFILE_FILES = "profile/"
-"""Attachments under it are the profile and its DBCs, named as the profile names them."""
+"""Attachments under it are the profile and its DBCs, named as the profile names them, be it by a
+path: these are names, and never become files."""
 TILE_FILE = "tile"
 """The attachment that is the tile."""
 
