@@ -52,12 +52,20 @@ def eqrt(
 class Serving:
     """`eqrt serve` in a process, from when it is ready; ended at the end of the `with` block."""
 
-    def __init__(self, *arguments: str, command: Sequence[str] = EQRT, **more: str) -> None:
-        """`command`: what to run instead of `eqrt`; `more` goes into its environment."""
+    def __init__(
+        self,
+        *arguments: str,
+        command: Sequence[str] = EQRT,
+        stderr: int = subprocess.PIPE,
+        **more: str,
+    ) -> None:
+        """`command`: what to run instead of `eqrt`; `stderr`: a file for its errors; `more` goes
+        into its environment.
+        """
         self._process = subprocess.Popen(
             [*command, "serve", *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=stderr,
             text=True,
             env=environment(**more),
         )
@@ -89,9 +97,24 @@ class Serving:
         assert self._process.stdout is not None
         self._process.stdout.close()
 
+    def stop_reading_errors(self) -> None:
+        """Close our end of its standard error."""
+        assert self._process.stderr is not None
+        self._process.stderr.close()
+
+    def writer_pid(self) -> int:
+        """The process that writes its recording."""
+        children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text(encoding="utf-8")
+        (writer,) = children.split()
+        return int(writer)
+
     def send(self, number: signal.Signals) -> None:
         """A signal."""
         self._process.send_signal(number)
+
+    def wait(self) -> int:
+        """Its exit status, without reading anything of what it says; `end` does that."""
+        return self._process.wait(PATIENCE_S)
 
     def end(self, by: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
         """Tell it to end: exit status, the rest of its output, its errors."""
@@ -106,6 +129,17 @@ class Serving:
         if self._process.poll() is None:
             self._process.kill()
             self._process.communicate()
+
+
+def fill_pipe(pid: int, descriptor: int) -> int:
+    """Fill the pipe that a process writes to, as one that nobody reads: bytes that it took."""
+    pipe = os.open(f"/proc/{pid}/fd/{descriptor}", os.O_WRONLY | os.O_NONBLOCK)
+    filled = 0
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            filled += os.write(pipe, b"\n")
+    os.close(pipe)
+    return filled
 
 
 class Heard:

@@ -38,7 +38,7 @@ from eqrt.runtime.prediction.watched import Model
 from eqrt.runtime.service import Service
 from faults.outcome import Outcome
 from faults.promises import sound
-from processes import EQRT, Heard, Serving
+from processes import EQRT, Heard, Serving, fill_pipe
 
 CARS = tuple(
     Car(object_id=n, x_m=8.0 + 12.0 * n, y_m=3.5 * (n % 3), speed_mps=2.0) for n in range(8)
@@ -109,7 +109,9 @@ class Served:
     folder: Path = Path()
     """`model` and `map.tile`, where they are copies."""
     stop_reading: Callable[[], None] | None = None
-    """Have its log go nowhere, where it talks."""
+    """Have what it says go nowhere: its log, or, where it records, its errors."""
+    writer_pid: int = 0
+    """Of the recording's writer."""
 
 
 @dataclass(frozen=True)
@@ -318,10 +320,33 @@ def tile_exchanged(world: World) -> Iterator[str]:
 @contextlib.contextmanager
 def recorder_killed(world: World) -> Iterator[str]:
     """The process that writes the recording."""
-    children = Path(f"/proc/{world.pid}/task/{world.pid}/children").read_text(encoding="utf-8")
-    for child in children.split():
-        os.kill(int(child), signal.SIGKILL)
+    os.kill(world.service.writer_pid, signal.SIGKILL)
     yield "1 SIGKILL"
+
+
+@contextlib.contextmanager
+def recorder_killed_unread(world: World) -> Iterator[str]:
+    """It would be said on standard error, but that pipe is full."""
+    filled = fill_pipe(world.pid, 2)
+    os.kill(world.service.writer_pid, signal.SIGKILL)
+    yield f"1 SIGKILL, {filled} bytes"
+
+
+@contextlib.contextmanager
+def recorder_killed_unheard(world: World) -> Iterator[str]:
+    """Likewise, but the other end of that pipe is closed."""
+    assert world.service.stop_reading is not None
+    world.service.stop_reading()
+    os.kill(world.service.writer_pid, signal.SIGKILL)
+    yield "1 SIGKILL, 1 pipe"
+
+
+@contextlib.contextmanager
+def disk_stands_still(world: World) -> Iterator[str]:
+    """Whoever writes to it stands still with it."""
+    os.kill(world.service.writer_pid, signal.SIGSTOP)
+    yield "1 SIGSTOP of the recorder"
+    os.kill(world.service.writer_pid, signal.SIGCONT)
 
 
 @contextlib.contextmanager
@@ -334,13 +359,7 @@ def disk_fills_up(world: World) -> Iterator[str]:
 @contextlib.contextmanager
 def log_not_read(world: World) -> Iterator[str]:
     """The pipe that it goes to is full."""
-    pipe = os.open(f"/proc/{world.pid}/fd/1", os.O_WRONLY | os.O_NONBLOCK)
-    filled = 0
-    with contextlib.suppress(BlockingIOError):
-        while True:
-            filled += os.write(pipe, b"\n")
-    os.close(pipe)
-    yield f"{filled} bytes"
+    yield f"{fill_pipe(world.pid, 1)} bytes"
 
 
 @contextlib.contextmanager
@@ -384,7 +403,11 @@ def served_and_recorded(channel: str, heard: Heard) -> Iterator[Served]:
     with tempfile.TemporaryDirectory(prefix="eqrt-faults-") as folder:
         record = ["--record", folder, "--record-keep-free", "1K"]
         with Serving(*_options(channel, heard), *record) as service:
-            yield Served(service.pid)
+            yield Served(
+                service.pid,
+                stop_reading=service.stop_reading_errors,
+                writer_pid=service.writer_pid(),
+            )
 
 
 @contextlib.contextmanager
@@ -437,8 +460,19 @@ FAULTS: dict[str, tuple[float, Fault, Callable[[str, Heard], AbstractContextMana
     "the tile file is damaged": (2.0, tile_file_damaged, served_from_files),
     "the tile is exchanged under way": (3.0, tile_exchanged, served_from_files),
     "the recorder is killed": (2.0, recorder_killed, served_and_recorded),
+    "the recorder is killed, errors are not read": (
+        2.0,
+        recorder_killed_unread,
+        served_and_recorded,
+    ),
+    "the recorder is killed, the errors' reader is gone": (
+        2.0,
+        recorder_killed_unheard,
+        served_and_recorded,
+    ),
     "nobody reads the log": (3.0, log_not_read, served_talking),
     "the log's reader goes away": (3.0, log_reader_gone, served_talking),
+    "the disk stands still for 3 s": (3.0, disk_stands_still, served_and_recorded),
     "the disk fills up": (6.0, disk_fills_up, served_and_recorded_into_little_room),
 }
 

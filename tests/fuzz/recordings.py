@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import can
 import mcap.writer
 import msgspec
 
 from drives import Car, cycle
-from eqrt.core.errors import LogError
+from eqrt.core.errors import LogError, TileError
 from eqrt.runtime.bus.logs import read_log
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.recording.exact_forecasts import encode_forecasts
 from eqrt.runtime.recording.identity import Identity
 from eqrt.runtime.recording.reader import Recording
-from eqrt.runtime.recording.replaying import unpacked
+from eqrt.runtime.recording.replaying import recorded_profile, recorded_tile
 from eqrt.runtime.recording.steps import Lost, PollEntry, Step, can_entry
 from eqrt.runtime.recording.topics import (
     FORMAT_VERSION,
@@ -31,6 +31,7 @@ from eqrt.runtime.recording.topics import (
 )
 from forecast_sets import many
 from fuzz.target import Target, assert_one_line, written
+from tiny_sensor import COUNTED, DBC
 
 _MSGPACK = msgspec.msgpack.Encoder()
 _IDENTITY = dict.fromkeys(Identity.__struct_fields__, "1") | {
@@ -40,10 +41,11 @@ _IDENTITY = dict.fromkeys(Identity.__struct_fields__, "1") | {
     "tile": "",
     "channels": "null",
 }
+_NO_PROFILE = {"generic.toml": '[sensors]\nname = "a"'}
 
 
 def read_file(data: bytes) -> None:
-    """By everything that reads recordings: as a log, entry by entry, and its files unpacked."""
+    """By everything that reads recordings: as a log, entry by entry, and the files in it."""
     path = written("a.mcap", data)
     try:
         for message in read_log(path):
@@ -59,11 +61,11 @@ def read_file(data: bytes) -> None:
         assert_one_line(error)
         return
     assert recording.remark is None or "\n" not in recording.remark
-    try:
-        with unpacked(recording, recording.attached) as folder:
-            assert all(path.is_relative_to(folder) for path in folder.rglob("*"))
-    except LogError as error:
-        assert_one_line(error)
+    for read in (recorded_profile, lambda one: recorded_tile(one, one.attached)):
+        try:
+            read(recording)
+        except (LogError, TileError) as error:
+            assert_one_line(error)
 
 
 def read_entries(data: bytes) -> None:
@@ -103,6 +105,7 @@ def _packed(entries: list[tuple[int, bytes]]) -> bytes:
 def _recording(
     entries: list[tuple[int, bytes]],
     compression: mcap.writer.CompressionType = mcap.writer.CompressionType.NONE,
+    profile: Mapping[str, str] = _NO_PROFILE,
     **identity: str,
 ) -> bytes:
     """A recording as the writer writes it."""
@@ -111,9 +114,8 @@ def _recording(
     writer.start(PROFILE, "seed")
     channels = [writer.register_channel(NAMES[topic], "msgpack", 0) for topic in Topic]
     writer.add_metadata(IDENTITY, _IDENTITY | identity)
-    writer.add_attachment(
-        0, 1, PROFILE_FILES + "generic.toml", "text/plain", b'[sensors]\nname = "a"'
-    )
+    for name, content in profile.items():
+        writer.add_attachment(0, 1, PROFILE_FILES + name, "text/plain", content.encode())
     writer.add_attachment(0, 1, TILE_FILE, "application/octet-stream", b"EQRTTILE")
     for number, (topic, payload) in enumerate(entries):
         writer.add_message(channels[topic], number, payload, number)
@@ -136,6 +138,8 @@ def _seed_entries() -> list[tuple[int, bytes]]:
 def _files() -> Iterator[bytes]:
     for compression in mcap.writer.CompressionType:
         yield _recording(_seed_entries(), compression)
+    profile = COUNTED.replace("tiny.dbc", "../tiny.dbc")
+    yield _recording([], profile={"generic.toml": profile, "../tiny.dbc": DBC})
     yield _recording([], part="-1", channels='{"car": "can0"}', stationary="true")
     yield _recording(_seed_entries(), tile="a.tile", tile_id="00000000", part="7")
 

@@ -19,6 +19,7 @@ from eqrt.runtime.decoding.profile import Profile, load_profile
 from eqrt.runtime.operation.changes import BusTeller, Changes
 from eqrt.runtime.operation.endpoint import Endpoint
 from eqrt.runtime.operation.event_log import LEVELS, EventLog, Level
+from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.operation.realtime import Realtime, Sweeper, parse_cpus, refuse
 from eqrt.runtime.operation.reload import Reloader, identity
 from eqrt.runtime.operation.service_manager import ServiceManager
@@ -54,10 +55,10 @@ def load_pipeline(
     """The pipeline that `add_pipeline_arguments` describes; the others are as for Pipeline."""
     predictor = Predictor.load(args.model)
     if predictor.license_notice:
-        print(f"eqrt: {predictor.license_notice}", file=sys.stderr)
+        Outlet(sys.stderr).put(f"eqrt: {predictor.license_notice}")
     tile = load_tile(args.tile) if args.tile else None
     if warning := unused_map(profile, tile):
-        print(f"eqrt: {warning}", file=sys.stderr)
+        Outlet(sys.stderr).put(f"eqrt: {warning}")
     return Pipeline(
         profile,
         predictor,

@@ -1,10 +1,13 @@
-"""Signals as questions that a loop asks: to end cleanly, and to load its files anew."""
+"""Signals as questions that a loop asks: to end cleanly, and to load its files anew.
+
+A handler interrupts the loop anywhere, even within an answer or another handler. So it notes the
+signal in a list and takes no lock: whoever holds that would be waited for by what interrupted it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
@@ -37,19 +40,22 @@ def asked_to_reload() -> Iterator[Callable[[], bool]]:
 
     Only in the main thread; the handler is put back at the end.
     """
-    asked = threading.Event()
+    asked: list[int] = []
 
     def is_asked() -> bool:
-        if not asked.is_set():
+        if not asked:
             return False
         asked.clear()
         return True
+
+    def ask(number: int, _frame: FrameType | None) -> None:
+        asked.append(number)
 
     number = getattr(signal, "SIGHUP", None)
     if number is None:
         yield is_asked
         return
-    before = signal.signal(number, lambda *_: asked.set())
+    before = signal.signal(number, ask)
     try:
         yield is_asked
     finally:

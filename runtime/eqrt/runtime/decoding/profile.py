@@ -7,18 +7,20 @@ sensor by name: what is loaded here is all it goes by.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from eqrt.core.errors import ProfileError
-from eqrt.runtime.decoding.dbc_files import Dbc, load_dbc
+from eqrt.runtime.decoding import dbc_files, toml_tables
+from eqrt.runtime.decoding.dbc_files import Dbc, load_dbc, parse_dbc
 from eqrt.runtime.decoding.ego_profile import EgoProfile, bind_ego
 from eqrt.runtime.decoding.latency_checks import check_latencies
 from eqrt.runtime.decoding.profile_schema import ProfileTable
 from eqrt.runtime.decoding.sensor_binding import bind_sensor
 from eqrt.runtime.decoding.sensor_profile import SensorProfile
-from eqrt.runtime.decoding.toml_tables import read_toml
+from eqrt.runtime.decoding.toml_tables import parse_toml, read_toml
 
 _HERE = Path(__file__).parent
 _MAX_BIAS_DEG_S = 10.0
@@ -82,14 +84,46 @@ def load_profile(name_or_path: str) -> Profile:
     """
     path = _path(name_or_path)
     table = read_toml(path, ProfileTable)
+    return _profile(table, path, lambda name: load_dbc(_dbc_path(name, path)))
+
+
+def parse_profile(files: Mapping[str, bytes], name: str) -> Profile:
+    """The profile of that name from files as `profile_files` gives them; no other is looked at,
+    whatever it names.
+
+    Raises ProfileError as `load_profile` does, and if one of them is not there.
+    """
+    path = f"{name}.toml"
+    table = parse_toml(_among(files, path, toml_tables.MAX_BYTES), ProfileTable, path)
+    return _profile(
+        table,
+        Path(path),
+        lambda dbc: parse_dbc(_among(files, dbc, dbc_files.MAX_BYTES), Path(dbc)),
+    )
+
+
+def profile_files(name_or_path: str) -> dict[str, bytes]:
+    """What `load_profile` reads, for `parse_profile`: the profile by its name with `.toml`, and its
+    DBCs by what the profile calls them, wherever they lie.
+
+    Raises ProfileError if one cannot be read.
+    """
+    path = _path(name_or_path)
+    table = read_toml(path, ProfileTable)
+    names = sorted({s.dbc for s in table.sensor} | {ego.dbc for ego in table.ego})
+    try:
+        dbcs = {name: _dbc_path(name, path).read_bytes() for name in names}
+        return {f"{path.stem}.toml": path.read_bytes()} | dbcs
+    except OSError as error:
+        raise ProfileError(f"cannot read {error.filename}: {error.strerror}") from error
+
+
+def _profile(table: ProfileTable, path: Path, load: Callable[[str], Dbc]) -> Profile:
+    """`path` names it, in errors too; `load` gives a DBC that it names."""
     if problem := _problem(table):
         raise ProfileError(f"{path}: {problem}")
     check_latencies(table, str(path))
-    dbc_at = cache(load_dbc)  # sensor and ego often share one
-
-    def dbc(name: str) -> Dbc:
-        return dbc_at(_dbc_path(name, path))
-
+    dbc = cache(load)  # sensor and ego often share one
     offset = table.arbitration_id_offset
     return Profile(
         name=path.stem,
@@ -106,20 +140,14 @@ def load_profile(name_or_path: str) -> Profile:
     )
 
 
-def profile_files(name_or_path: str) -> dict[str, bytes]:
-    """The files that `load_profile` reads: the profile's name with `.toml`, and its DBCs, named as
-    the profile names them. Together in a folder they are the same profile.
-
-    Raises ProfileError if one cannot be read.
-    """
-    path = _path(name_or_path)
-    table = read_toml(path, ProfileTable)
-    names = sorted({s.dbc for s in table.sensor} | {ego.dbc for ego in table.ego})
-    try:
-        dbcs = {name: _dbc_path(name, path).read_bytes() for name in names}
-        return {path.name: path.read_bytes()} | dbcs
-    except OSError as error:
-        raise ProfileError(f"cannot read {error.filename}: {error.strerror}") from error
+def _among(files: Mapping[str, bytes], name: str, max_bytes: int) -> bytes:
+    if name not in files:
+        raise ProfileError(f"there is no {name!r} among its files")
+    if (size := len(files[name])) > max_bytes:
+        raise ProfileError(
+            f"{name!r} has {size:,} bytes, and no such file has more than {max_bytes:,}"
+        )
+    return files[name]
 
 
 def _problem(table: ProfileTable) -> str | None:

@@ -30,12 +30,22 @@ def read_toml(path: Path, kind: type[T]) -> T:
     Raises ProfileError if it cannot be read, is not TOML, or has a wrong key or type.
     """
     try:
-        values = tomllib.loads(read_at_most(MAX_BYTES, path).decode("utf-8"))
+        content = read_at_most(MAX_BYTES, path)
     except OSError as error:
         raise ProfileError(f"cannot read {path}: {error.strerror or error}") from error
+    return parse_toml(content, kind, str(path))
+
+
+def parse_toml(content: bytes, kind: type[T], path: str) -> T:
+    """What a file contains as a `kind`; `path` names it in errors.
+
+    Raises ProfileError if it is not TOML, or has a wrong key or type.
+    """
+    try:
+        values = tomllib.loads(content.decode("utf-8"))
     except (ValueError, RecursionError) as error:  # neither UTF-8 nor TOML, or far too deep
         raise ProfileError(f"{path} is not TOML: {error}") from error
-    return cast("T", _table(values, kind, str(path), ""))
+    return cast("T", _table(values, kind, path, ""))
 
 
 def _value(value: object, kind: Any, path: str, where: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 from typing import TextIO
@@ -14,10 +15,11 @@ class Outlet:
         """What the stream itself has kept so far is written first."""
         self._stream = stream
         try:
-            stream.flush()
             self._file: int | None = stream.fileno()
         except (OSError, ValueError):  # no file: nobody to wait for
             self._file = None
+        with contextlib.suppress(OSError):  # its reader has gone, as `put` will find
+            stream.flush()
 
     def put(self, line: str) -> bool:
         """Write a line; False if nobody takes it now, or ever again."""

@@ -36,7 +36,7 @@ class Identity(msgspec.Struct, frozen=True, kw_only=True):
     """When the service started: UTC, ISO 8601."""
     command: str
     """How it was started."""
-    profile: Annotated[str, msgspec.Meta(pattern=r"^[^/\x00-\x1f]{1,200}$")]
+    profile: Annotated[str, msgspec.Meta(pattern=r"^[^/\x00-\x1f]{1,255}$")]
     """A file's name without its ending."""
     model: str
     """The name in the model's contract."""

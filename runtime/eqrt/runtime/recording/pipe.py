@@ -55,16 +55,15 @@ class PipeEnd:
         except OSError:  # EPIPE: the writer has ended
             self._give_up()
 
-    def drain(self, patience_s: float) -> None:
-        """Send what waits, as far as it is taken within `patience_s`."""
-        give_up_s = time.monotonic() + patience_s
+    def drain(self, give_up_s: float) -> None:
+        """Send what waits, as far as it is taken before `give_up_s` on the monotonic clock."""
         while self._waiting and self.is_open and (left_s := give_up_s - time.monotonic()) > 0.0:
             select.select([], [self._descriptor], [], left_s)
             self.push()
 
-    def close(self, patience_s: float) -> None:
-        """Send the rest, as far as it is taken within `patience_s`, and say that this was all."""
-        self.drain(patience_s)
+    def close(self, give_up_s: float) -> None:
+        """Send the rest, as far as it is taken before `give_up_s`, and say that this was all."""
+        self.drain(give_up_s)
         self._give_up()
         os.close(self._descriptor)
 

@@ -20,6 +20,7 @@ import can
 import msgspec
 
 from eqrt.core.errors import RecordingError
+from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.exact_forecasts import encode_forecasts
@@ -29,9 +30,11 @@ from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, PollEntry, TapedClock, can_entry
 from eqrt.runtime.recording.topics import DESCRIPTION, ENTRY, LENGTH, Topic
 
+END_S = 3.0
+"""How long the end of the service may wait for the disk, in all: the TimeoutStopSec of
+deploy/eqrt.service has to do for everything else as well."""
 _BATCH_S = 0.1  # what a killed service takes with it
 _BATCH_BYTES = 1 << 16
-_END_S = 5.0  # how long the end of the service may wait for the disk
 _MSGPACK = msgspec.msgpack.Encoder()
 _JSON = msgspec.json.Encoder()
 
@@ -138,14 +141,18 @@ class Recorder:
         self._in_batch = dict.fromkeys(Topic, 0)
 
     def close(self) -> None:
-        """Send the rest and wait for the writer, but not for ever; leaving `with` does it too."""
+        """Send the rest and wait for the writer, END_S in all; leaving `with` does it too.
+
+        A writer that takes longer ends by itself when it has written what it was sent.
+        """
+        give_up_s = time.monotonic() + END_S
         self.flush()
         if any(self._lost.values()):  # it is noted, too, if there is room before the end
-            self._pipe.drain(_END_S)
+            self._pipe.drain(give_up_s)
             self._offer(self._lost_entry())
-        self._pipe.close(_END_S)
+        self._pipe.close(give_up_s)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._writer.wait(_END_S)
+            self._writer.wait(max(give_up_s - time.monotonic(), 0.0))
 
     def __enter__(self) -> Self:
         return self
@@ -160,11 +167,9 @@ class Recorder:
         code = self._writer.poll()
         if code is not None and code < 0 and not self._is_said:
             self._is_said = True
-            print(
-                f"eqrt serve: recording ended: its writer was killed ({signal.Signals(-code).name})"
-                "; predictions go on",
-                file=sys.stderr,
-                flush=True,
+            name = signal.Signals(-code).name
+            Outlet(sys.stderr).put(
+                f"eqrt serve: recording ended: its writer was killed ({name}); predictions go on"
             )
 
     def _is_described(self) -> bool:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from eqrt.core.errors import ContractError, LogError
+from eqrt.core.errors import ContractError, LogError, ProfileError
+from eqrt.core.tile import decode
 from eqrt.runtime.bus.channels import parse_channels
-from eqrt.runtime.decoding.profile import Profile, load_profile
+from eqrt.runtime.decoding.profile import Profile, load_profile, parse_profile
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.pipeline import Pipeline, lanes_for
 from eqrt.runtime.prediction.modes import HOLD_S
@@ -80,14 +80,14 @@ class Replay:
         """Whether the present step is as it was."""
         self._exact_from_s = -math.inf
         """On the pipeline's clock; inf = not as long as the same model and tile predict."""
-        with unpacked(recording, recording.attached) as folder:
-            self.pipeline = self._pipeline(folder)
+        self.pipeline = self._pipeline()
 
-    def _pipeline(self, folder: Path) -> Pipeline:
-        """As it was when the recording began; `folder` has the files that travel in it."""
+    def _pipeline(self) -> Pipeline:
+        """As it was when the recording began."""
         recording, instead, identity = self.recording, self._instead, self.recording.identity
-        profile = _profile(recording, instead, folder)
-        predictor, tile = self._predicting(identity, folder)
+        given = instead.profile
+        profile = recorded_profile(recording) if given is None else load_profile(given)
+        predictor, tile = self._predicting(identity, recording.attached)
         return Pipeline(
             profile,
             predictor,
@@ -98,14 +98,16 @@ class Replay:
             run_by=lambda model: ReplayedRunner(model, self._clock),
         )
 
-    def _predicting(self, identity: Identity, folder: Path) -> tuple[Predictor, Tile | None]:
+    def _predicting(
+        self, identity: Identity, attached: Mapping[str, bytes]
+    ) -> tuple[Predictor, Tile | None]:
         """The model and tile that predict from here on; if one is not here, another, for nothing
         but to go on.
         """
         predictor, reason = self._models.find(identity)
         tile = None if self._instead.tile is None else load_tile(self._instead.tile)
         if tile is None and identity.tile:
-            tile = _recorded_tile(folder)
+            tile = recorded_tile(self.recording, attached)
             if tile is None or tile.info.tile_id != identity.tile_id:
                 reason = (
                     reason or f"their tile, {one_line(identity.tile_id)}, is not in the recording"
@@ -140,8 +142,7 @@ class Replay:
     def _exchange(self, exchanged: Exchanged) -> None:
         if self._exact_from_s == math.inf:
             self._exact_from_s = math.nan  # until the next step tells the time
-        with unpacked(self.recording, exchanged.attached) as folder:
-            predictor, tile = self._predicting(exchanged.identity, folder)
+        predictor, tile = self._predicting(exchanged.identity, exchanged.attached)
         self.pipeline.exchange(predictor, tile, lanes_for(tile, predictor))
 
 
@@ -191,35 +192,28 @@ def _unknown(identity: Identity) -> str:
     )
 
 
-def _profile(recording: Recording, instead: Instead, folder: Path) -> Profile:
-    if instead.profile is not None:
-        return load_profile(instead.profile)
-    return load_profile(str(folder / PROFILE_FILES / f"{recording.identity.profile}.toml"))
+def recorded_profile(recording: Recording) -> Profile:
+    """The profile that travels in the recording, from what travels with it and no other file.
 
-
-def _recorded_tile(folder: Path) -> Tile | None:
-    path = folder / TILE_FILE
-    return load_tile(path) if path.exists() else None
-
-
-@contextlib.contextmanager
-def unpacked(recording: Recording, files: Mapping[str, bytes]) -> Iterator[Path]:
-    """A folder with files that travel in the recording."""
-    with tempfile.TemporaryDirectory(prefix="eqrt-") as name:
-        folder = Path(name)
-        for attached, content in files.items():
-            path = folder / _inside(attached, recording)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        yield folder
-
-
-def _inside(name: str, recording: Recording) -> PurePosixPath:
-    """The name, if it cannot lead out of the folder."""
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or not path.parts or not name.isprintable():
+    Raises LogError if it cannot be used.
+    """
+    files = {
+        name.removeprefix(PROFILE_FILES): content
+        for name, content in recording.attached.items()
+        if name.startswith(PROFILE_FILES)
+    }
+    try:
+        return parse_profile(files, recording.identity.profile)
+    except ProfileError as error:
         raise LogError(
-            f"{recording.paths[0]}: a file in it is named {name!r}, which leads elsewhere; give "
-            "the profile with --profile"
-        )
-    return path
+            f"{recording.paths[0]}: the profile in it cannot be used ({one_line(error)}); give one "
+            "with --profile"
+        ) from error
+
+
+def recorded_tile(recording: Recording, attached: Mapping[str, bytes]) -> Tile | None:
+    """The tile among files that travel in the recording. Raises TileError if it is damaged."""
+    if TILE_FILE not in attached:
+        return None
+    lane_map, info = decode(attached[TILE_FILE], f"{recording.paths[0]}: the tile in it")
+    return Tile(lane_map, info, Path(TILE_FILE))

@@ -1,6 +1,6 @@
 """What stands in a recording: its topics, and how their messages are written (docs/recording.md).
 
-The recorder and its writer, which is another process and imports nothing but this and the writer's
+The recorder and its writer, which is another process and imports little but this and the writer's
 library, share this table.
 """
 
@@ -15,7 +15,8 @@ FORMAT_VERSION = 1
 IDENTITY = "eqrt"
 """Name of the metadata record that says what the recording is of."""
 PROFILE_FILES = "profile/"
-"""Attachments under it are the profile and its DBCs, named as the profile names them."""
+"""Attachments under it are the profile and its DBCs, named as the profile names them, be it by a
+path: these are names, and never become files."""
 TILE_FILE = "tile"
 """The attachment that is the tile."""
 

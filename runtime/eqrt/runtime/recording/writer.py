@@ -22,6 +22,7 @@ from typing import BinaryIO
 import msgspec
 from mcap.writer import Writer
 
+from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.recording.folder import delete_oldest, file_name, free_bytes, total_bytes
 from eqrt.runtime.recording.order import Attached, Description, Order
 from eqrt.runtime.recording.topics import (
@@ -56,19 +57,25 @@ def main() -> int:
         order = msgspec.msgpack.decode(next(iter(pieces)) or b"", type=Order)
     except (StopIteration, msgspec.MsgspecError):
         return 1  # the service ended before it began
+    status, reason = _record(order, pieces)
+    if reason:  # the files are whole by now, whoever reads this
+        Outlet(sys.stderr).put(f"eqrt serve: recording ended: {reason}; predictions go on")
+    return status
+
+
+def _record(order: Order, pieces: _Pieces) -> tuple[int, str]:
+    """Write and close; the exit status, and why it ended before its time, if it did."""
     recording = _Recording(order)
     try:
         _write(recording, pieces)
     except LimitReachedError as reached:
-        _say(f"recording ended: {reached}; predictions go on")
-        return REACHED_A_LIMIT
+        return REACHED_A_LIMIT, str(reached)
     except OSError as error:
-        _say(f"recording ended: {order.folder}: {error.strerror}; predictions go on")
-        return 1
+        return 1, f"{order.folder}: {error.strerror}"
     finally:
         with contextlib.suppress(OSError):
             recording.close()
-    return 0
+    return 0, ""
 
 
 def _write(recording: _Recording, pieces: _Pieces) -> None:
@@ -89,10 +96,6 @@ def _stand_back() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the service's real time
     with contextlib.suppress(OSError):
         os.nice(_NICE)
-
-
-def _say(text: str) -> None:
-    print(f"eqrt serve: {text}", file=sys.stderr, flush=True)
 
 
 class _Pieces:
