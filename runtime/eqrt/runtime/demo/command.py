@@ -119,8 +119,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--seconds is {args.seconds}; give a number above 0, 10 shows something")
     _make_folder(args.out)
     parts = [part for part in PARTS if args.part in (None, part.name)]
-    print(_ABOUT_LINES)
     with watched(args.view) as viewers:
+        print(f"\n{_ABOUT_LINES}", end="", flush=True)
         for index, part in enumerate(parts):
             print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
             result = play_part(part, args.seconds, viewers)
