@@ -41,10 +41,10 @@ _SILENT_S = 3.0  # after the player has ended
 
 
 _ABOUT_LINES = """\
-A line a second. Errors begin after 4 s, when what was predicted has happened: the mean distance
-between where eqrt said that a car would be and where it was, over all scored so far. Modes: RUN
-predicts with the map, NO_MAP without one; NO_POSE at first is normal (nothing has told yet how the
-car moves); LATE: this machine had too much else to do.
+A line a second. Errors come after 4 s, when what was predicted has happened: how far cars were from
+where eqrt said that they would be, on average over 3 s (ADE) and at their end (FDE), over all that
+was scored so far. Modes: RUN predicts with the map, NO_MAP without one; NO_POSE at first is normal
+(nothing has told yet how the car moves); LATE: this machine had too much else to do.
 """
 _HEAD = (
     f"  {'time':>6}  {'mode':8} {'':11}  {'compute':>8}   "
@@ -119,8 +119,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--seconds is {args.seconds}; give a number above 0, 10 shows something")
     _make_folder(args.out)
     parts = [part for part in PARTS if args.part in (None, part.name)]
-    print(_ABOUT_LINES)
     with watched(args.view) as viewers:
+        print(f"\n{_ABOUT_LINES}", end="", flush=True)
         for index, part in enumerate(parts):
             print(f"\n== Part {index + 1} of {len(parts)}: {part.name}\n{part.about}\n", flush=True)
             result = play_part(part, args.seconds, viewers)

@@ -117,7 +117,7 @@ class ForecastSet:
         """(A,) the target was just found, and its velocity is not known: `trajectories` stay at
         `position`, which says nothing.
         """
-        return np.isnan(self.velocity).any(axis=1)
+        return np.asarray(np.isnan(self.velocity).any(axis=1))
 
     def targets(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> ForecastSet:
         """The same cycle with only some of its targets."""
