@@ -239,6 +239,31 @@ def test_a_folder_of_something_else_is_not_touched(
     assert contents(tmp_path / "photos") == {"cat.jpg": b""}
 
 
+def test_the_page_of_another_program_is_not_ours(
+    tmp_path: Path, drives: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`dataset.json` and `shard-...` are names that others use, too."""
+    theirs = tmp_path / "theirs"
+    (theirs / "shard-00000").mkdir(parents=True)
+    (theirs / "shard-00000/rows.bin").write_bytes(b"theirs")
+    (theirs / "dataset.json").write_text('{"name": "theirs", "settings": {}}')
+    before = contents(theirs)
+    for options in ([], ["--force"]):
+        assert prepare(drives, theirs, model, *options) == 1
+        assert "not empty, and not a prepared folder" in capsys.readouterr().err
+    assert contents(theirs) == before
+
+
+def test_force_replaces_what_has_a_damaged_page(
+    tmp_path: Path, drives: Path, model: Path, whole: Contents
+) -> None:
+    page = tmp_path / "whole/dataset.json"
+    page.write_bytes(page.read_bytes()[:200])
+    assert prepare(drives, tmp_path / "whole", model) == 1
+    assert prepare(drives, tmp_path / "whole", model, "--force") == 0
+    assert contents(tmp_path / "whole") == whole
+
+
 def spoil(drives: Path, number: int) -> Path:
     """Cut a scenario short."""
     path = drives / f"USA_Peach-{number}_8_T-1.xml.gz"

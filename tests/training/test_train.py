@@ -133,6 +133,19 @@ def test_a_folder_with_a_training_in_it_is_not_overwritten(
     assert (tmp_path / "out" / "model.safetensors").read_bytes() == before
 
 
+@pytest.mark.parametrize("more", [[], ["--resume"]])
+def test_a_model_whose_state_is_gone_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str]
+) -> None:
+    model = tmp_path / "out/model.safetensors"
+    model.parent.mkdir()
+    model.write_bytes(b"weeks of work")
+    arguments = ["train", "--config", str(tiny_file(tmp_path)), "--data", str(DATA[0])]
+    assert main([*arguments, "--out", str(tmp_path / "out"), *more]) == 2
+    assert "holds model.safetensors and no state.safetensors" in capsys.readouterr().err
+    assert model.read_bytes() == b"weeks of work"
+
+
 def test_held_out_recordings_that_are_not_there_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
