@@ -14,6 +14,7 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.training.checkpoint import load_checkpoint
 from eqrt.training.configuration import TrainConfig, load_config
+from eqrt.training.dataset.split import group_digest
 from eqrt.training.dataset.store import open_data
 from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity, predict
 from eqrt.training.networks.registry import build_network
@@ -73,6 +74,7 @@ def test_the_command_writes_a_checkpoint_that_says_where_it_comes_from(
     assert "NGSIM" in card.data
     assert card.license == "CC-BY-SA-4.0"
     assert not card.non_commercial
+    assert card.trained_on == (group_digest("NGSIM", "USA_Peach-4"),)  # the other is held out
     assert card.metrics.keys() == card.baseline.keys()
     assert card.metrics["fde_3s"] > 0.0
     assert (card.steps, card.seed) == (4, 1)

@@ -19,7 +19,7 @@ from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
 from eqrt.export.changelog import changelog
-from eqrt.export.model_card import model_card
+from eqrt.export.model_card import TRAINED_ON, model_card
 from eqrt.export.place import SUMS, claim, put
 from eqrt.export.to_onnx import to_onnx
 from eqrt.export.vectors import TURNED, TWINS, named_scenes
@@ -71,6 +71,9 @@ def write_artifact(
         text = model_card(contract, card, _turned_apart_m(expected))
         (draft / "README.md").write_text(text, encoding="utf-8")
         (draft / "CHANGELOG.md").write_text(log, encoding="utf-8")
+        if card.trained_on:
+            groups = "".join(f"{group}\n" for group in card.trained_on)
+            (draft / TRAINED_ON).write_text(groups, encoding="utf-8")
         for index, (name, scene) in enumerate(scenes.items()):
             _write_vector(scene, expected[name], draft / f"test_data_set_{index}", name)
         _write_checksums(draft)

@@ -7,6 +7,9 @@ import re
 from eqrt.core.contract import ModelContract
 from eqrt.training.checkpoint import Card
 
+TRAINED_ON = "trained_on.txt"
+"""Beside the card: `Card.trained_on`, a group per line, for `eqrt eval` to say when it measures on
+one of them."""
 EQUIVARIANT_M = 5e-3
 """What turning a scene 500 m away may change by float32's rounding."""
 

@@ -132,6 +132,7 @@ class Recorder:
     def _card(self, metrics: dict[str, float]) -> Card:
         config, data = self._goal.config, self._goal.data
         source = credited(data.source, self._goal.start)
+        before = () if self._goal.start is None else self._goal.start.trained_on
         return Card(
             name=config.name,
             data=source.credits,
@@ -146,6 +147,7 @@ class Recorder:
             seed=config.train.seed,
             recordings=data.recordings,
             samples=self._state.step * config.train.batch_size,
+            trained_on=tuple(sorted({*data.trained_on, *before})),
         )
 
 

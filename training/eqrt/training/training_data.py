@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError
 from eqrt.training.configuration import DataConfig, TrainConfig
-from eqrt.training.dataset.split import TRAIN, VAL, Split, in_share
+from eqrt.training.dataset.split import TRAIN, VAL, Split, group_digest, in_share
 from eqrt.training.dataset.store import WindowStore, open_data
 from eqrt.training.dataset.windows import MIN_DRIVE_M, Windows, join
 from eqrt.training.recordings.recording import Source
@@ -31,6 +31,8 @@ class TrainingData:
     source: Source
     recordings: int = 0
     """How many the pool's windows come from; 0 = not known."""
+    trained_on: frozenset[str] = frozenset()
+    """The groups that they are of (`group_digest`)."""
 
 
 def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingData:
@@ -59,7 +61,8 @@ def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingDa
         )
     pool = Pool(store, rows, _weights(config.data, store, rows))
     recordings = len(np.unique(store.column("recording")[rows]))
-    return TrainingData(pool, held_out, store.source, recordings)
+    groups = frozenset[str]().union(*(_groups(s, config.data.train_share) for s in stores))
+    return TrainingData(pool, held_out, store.source, recordings, groups)
 
 
 def measured_windows(store: WindowStore, split: str) -> Windows:
@@ -99,6 +102,12 @@ def _check_sides(store: WindowStore, where: str) -> None:
             f"{where}: group {both[0]} is held out in one dataset and trained on in another; name "
             "what is held out in [data] held_out, or prepare them with the same split"
         )
+
+
+def _groups(store: WindowStore, share: float) -> set[str]:
+    """Digests of the groups of a dataset that are trained on."""
+    trained = {entry.group for entry in store.recordings if entry.split == TRAIN}
+    return {group_digest(store.source.name, g) for g in trained if in_share(g, share)}
 
 
 def _shared(store: WindowStore, rows: Rows, share: float) -> Rows:
