@@ -55,6 +55,7 @@ class Recorder:
         self._watch = Stopwatch()
         self._seen = state.step
         if ranks.leads:
+            self._fingerprint = goal.fingerprint()
             self._log = MetricsLog(goal.out / METRICS_FILE, after=state.step)
             scene, held_out = goal.config.model.scene, goal.data.held_out
             self._baseline = evaluate_constant_velocity(held_out, scene.num_modes, scene.dt_s)
@@ -89,7 +90,7 @@ class Recorder:
         self._meter.settle(self._state)
         if self._ranks.leads:
             goal = self._goal
-            save_state(goal.out / STATE_FILE, self._state, goal.config, goal.fingerprint())
+            save_state(goal.out / STATE_FILE, self._state, goal.config, self._fingerprint)
 
     def plot(self) -> None:
         """Draw the metrics so far."""

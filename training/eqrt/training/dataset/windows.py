@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -73,6 +74,12 @@ class Windows:
     def select(self, rows: Rows) -> Windows:
         """The windows `rows`."""
         return Windows(**{name: getattr(self, name)[rows] for name in COLUMNS})
+
+    def checksum(self, before: int = 0) -> int:
+        """Of every bit, going on from that of what came before."""
+        for name in COLUMNS:
+            before = zlib.crc32(np.ascontiguousarray(getattr(self, name)).tobytes(), before)
+        return before
 
     def tensors(self) -> dict[str, Tensor]:
         """Inputs and futures as torch tensors, no copy."""
