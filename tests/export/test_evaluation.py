@@ -15,6 +15,7 @@ import torch
 
 from eqrt.cli import main
 from eqrt.core.errors import EqrtError
+from eqrt.core.metrics import horizons_s
 from eqrt.export.artifact import write_artifact
 from eqrt.export.evaluation.manoeuvres import MANOEUVRES, SPEED_BANDS
 from eqrt.export.evaluation.measure import MODEL, Piece, Settings, measure
@@ -26,7 +27,6 @@ from eqrt.export.evaluation.tally import (
     Tally,
     end_errors,
     errors_of,
-    horizons_s,
     membership,
     mode_counts,
 )

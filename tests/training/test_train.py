@@ -12,7 +12,9 @@ import torch
 
 from eqrt.cli import main
 from eqrt.core.errors import EqrtError
+from eqrt.export.model_card import model_card
 from eqrt.training.checkpoint import load_checkpoint
+from eqrt.training.compare import Run, curve
 from eqrt.training.configuration import TrainConfig, load_config
 from eqrt.training.dataset.split import group_digest
 from eqrt.training.dataset.store import open_data
@@ -22,7 +24,7 @@ from eqrt.training.recorder import MODEL_FILE
 from eqrt.training.sampling import Pool
 from eqrt.training.state import new_optimizer, new_state, update_average
 from eqrt.training.train import learning_rate, train, train_step
-from eqrt.training.training_data import TrainingData
+from eqrt.training.training_data import TrainingData, open_training_data
 from source_tree import ROOT
 from tiny_training import DATA, NGSIM, TOML, tiny, tiny_data, tiny_file
 from window_samples import packed_scenes
@@ -92,6 +94,20 @@ def test_the_checkpoint_predicts_what_was_evaluated(tmp_path: Path) -> None:
     checkpoint = load_checkpoint(tmp_path / "out" / "model.safetensors")
     again = evaluate(checkpoint.network, tiny_data().held_out, checkpoint.config.scene.dt_s)
     assert again == checkpoint.card.metrics
+
+
+@pytest.mark.parametrize(("steps", "end"), [(15, "1.5s"), (40, "4s")])
+def test_any_horizon_is_trained_and_measured_up_to_its_end(
+    tmp_path: Path, steps: int, end: str
+) -> None:
+    config = tiny({"scene": {"horizon_steps": steps}}).with_steps(2)
+    train(config, open_training_data(config, DATA), tmp_path)
+    card = load_checkpoint(tmp_path / MODEL_FILE).card
+    assert list(card.metrics)[-2:] == list(card.baseline)[-2:] == [f"ade_{end}", f"fde_{end}"]
+    assert (tmp_path / "errors.png").exists()
+    assert f"| FDE {end[:-1]} s | " in model_card(config.model.contract("x", "1.0.0"), card, 0.0)
+    figure = curve([Run("x", card)])
+    assert figure.axes[1].get_ylabel().startswith(f"FDE {end[:-1]} s")
 
 
 def test_metrics_stand_in_a_line_per_evaluation_and_in_pictures(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def _what_counts(contract: ModelContract) -> str:
 
 def _metric(name: str) -> str:
     """How a table calls a metric: `ade_3s` is ADE 3 s."""
-    if of_mean := re.fullmatch(r"(ade|fde)_(\d+)s", name):
+    if of_mean := re.fullmatch(r"(ade|fde)_([\d.]+)s", name):
         return f"{of_mean[1].upper()} {of_mean[2]} s"
     if ellipse := re.fullmatch(r"inside_(\d+)", name):
         return f"truth inside the {ellipse[1]} % ellipse, share"

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.metrics import horizons_s
 from eqrt.export.evaluation.measure import MODEL, PUBLISHED, REFUSED, DataCard, Measured, Settings
 from eqrt.export.evaluation.predictors import ModelCard
-from eqrt.export.evaluation.tally import GROUPS, Tally, horizons_s, mode_counts
+from eqrt.export.evaluation.tally import GROUPS, Tally, mode_counts
 from eqrt.training.dataset.store import license_notice
 from eqrt.training.recordings.recording import Source
 
