@@ -53,6 +53,7 @@ FLAWS: dict[str, list[Node]] = {
         ("Sub", ["point", "now"], "to_line", {}),
         ("Add", ["steady", "to_line"], "flawed", {}),
     ],
+    "measured": [("Add", ["steady", "heading"], "flawed", {})],
     "unmasked": [
         ("Gather", ["of_target", "step_before"], "raw_before", {"axis": 1}),
         ("Sub", ["now", "raw_before"], "flawed", {}),

@@ -41,6 +41,27 @@ def test_errors_of_a_hand_made_case() -> None:
     np.testing.assert_allclose(list(table.values()), list(expected.values()))
 
 
+@pytest.mark.parametrize(
+    ("steps", "names"),
+    [
+        (3, ["ade_0.3s", "fde_0.3s"]),
+        (20, ["ade_1s", "fde_1s", "ade_2s", "fde_2s"]),
+        (25, ["ade_1s", "fde_1s", "ade_2s", "fde_2s", "ade_2.5s", "fde_2.5s"]),
+    ],
+)
+def test_errors_are_given_as_far_as_the_horizon_goes_and_at_its_end(
+    steps: int, names: list[str]
+) -> None:
+    table = error_table(np.arange(1.0, steps + 1.0)[None], dt_s=0.1)
+    assert list(table) == names
+    assert table[names[-1]] == steps
+
+
+def test_an_error_beyond_the_horizon_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"no error at 3 s: 20 steps of 0\.1 s"):
+        error_table(np.ones((1, 20)), 0.1, (1, 2, 3))
+
+
 def test_displacement_is_the_straight_distance() -> None:
     np.testing.assert_allclose(displacement(np.array([[3.0, 4.0]]), np.zeros((1, 2))), [5.0])
 

@@ -409,3 +409,22 @@ def test_a_failed_export_leaves_the_old_artifact_alone(
         write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy, "Other weights.")
     assert (copy / "SHA256SUMS").read_bytes() == before
     assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]
+
+
+def test_the_folder_of_a_training_is_not_exported_over(
+    model: CompactPredictor, tmp_path: Path
+) -> None:
+    (tmp_path / "model.safetensors").write_text("precious")
+    with pytest.raises(EqrtError, match="not empty, and not an artifact; choose another --out"):
+        write_artifact(model, SCENE.contract("test", "1.0.0"), CARD, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+def test_exporting_to_a_link_replaces_what_it_leads_to(
+    model: CompactPredictor, copy: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "current").symlink_to(copy.name)
+    contract = SCENE.contract("test", "1.3.0")
+    write_artifact(model, contract, CARD, tmp_path / "current", "Nothing.")
+    assert (tmp_path / "current").is_symlink()
+    assert Predictor.load(copy).contract.version == "1.3.0"

@@ -410,3 +410,11 @@ def test_the_license_is_the_recorders_own_until_they_say() -> None:
     assert (own.license, own.credits, own.non_commercial) == (RECORDERS_OWN, RECORDERS_OWN, False)
     said = reader(profile="generic", license="CC-BY-NC-4.0", credits="(c) Somebody").source
     assert (said.credits, said.non_commercial) == ("(c) Somebody", True)
+
+
+@pytest.mark.parametrize(
+    "terms",
+    ["CC-BY-NC-SA-4.0", "CC BY-NC 4.0", "CC BY NC 4.0", "Non-commercial research", "noncommercial"],
+)
+def test_a_license_against_commerce_is_told_however_it_is_spelled(terms: str) -> None:
+    assert reader(profile="generic", license=terms).source.non_commercial

@@ -15,6 +15,7 @@ import torch
 
 from eqrt.cli import main
 from eqrt.core.errors import EqrtError
+from eqrt.core.metrics import horizons_s
 from eqrt.export.artifact import write_artifact
 from eqrt.export.evaluation.manoeuvres import MANOEUVRES, SPEED_BANDS
 from eqrt.export.evaluation.measure import MODEL, Piece, Settings, measure
@@ -26,12 +27,12 @@ from eqrt.export.evaluation.tally import (
     Tally,
     end_errors,
     errors_of,
-    horizons_s,
     membership,
     mode_counts,
 )
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from eqrt.training.checkpoint import Card, save_checkpoint
+from eqrt.training.dataset.split import group_digest
 from eqrt.training.dataset.windows import Windows
 from eqrt.training.evaluate import Predicted
 from eqrt.training.networks.compact import CompactConfig
@@ -304,6 +305,31 @@ def test_a_checkpoint_of_eight_modes(packed: Path, tmp_path: Path, checkpoint: P
     assert table["brier_min_fde_6"] >= table["min_fde_6"]
     folder = evaluate(tmp_path, "--data", packed, model=checkpoint.parent)
     assert folder["groups"] == report["groups"]
+
+
+@pytest.mark.parametrize("kind", ["checkpoint", "artifact"])
+def test_measuring_on_what_was_trained_on_is_said(
+    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Two of three scenes; the third is another source's of the same name."""
+    groups = [("Argoverse 1", "1"), ("Argoverse 1", "2"), ("NGSIM", "3")]
+    card = replace(CARD, trained_on=tuple(sorted(group_digest(*group) for group in groups)))
+    config = ModelConfig(scene=SCENE, kind="compact", network=NETWORK)
+    model, path = build_network(config).eval(), tmp_path / kind
+    if kind == "checkpoint":
+        save_checkpoint(path / "model.safetensors", model, config, card)
+    else:
+        write_artifact(model, config.contract("eight-modes", "1.0.0"), card, path)
+    assert evaluate(tmp_path, "--data", packed, model=path)["data"][0]["trained_on"] == 2
+    said = "warning     the model was trained on the vehicles of 2 of its 3 recordings, by their"
+    assert said in capsys.readouterr().out
+
+
+def test_a_model_that_does_not_say_what_it_was_trained_on_is_not_warned_of(
+    packed: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(tmp_path, "--data", packed, model=checkpoint)["data"][0]["trained_on"] == 0
+    assert "warning" not in capsys.readouterr().out
 
 
 def test_calibration_by_hand() -> None:

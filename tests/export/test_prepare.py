@@ -22,6 +22,7 @@ from eqrt.training.dataset.store import open_data
 from eqrt.training.recordings.formats import find_format
 from processes import EQRT, environment
 from source_tree import ROOT
+from tiny_training import DATA, tiny, tiny_file
 from window_samples import CONTRACT, NGSIM, OPTIONS, SCENARIO, assert_same, packed_scenes
 
 Contents = dict[str, bytes]
@@ -239,6 +240,31 @@ def test_a_folder_of_something_else_is_not_touched(
     assert contents(tmp_path / "photos") == {"cat.jpg": b""}
 
 
+def test_the_page_of_another_program_is_not_ours(
+    tmp_path: Path, drives: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`dataset.json` and `shard-...` are names that others use, too."""
+    theirs = tmp_path / "theirs"
+    (theirs / "shard-00000").mkdir(parents=True)
+    (theirs / "shard-00000/rows.bin").write_bytes(b"theirs")
+    (theirs / "dataset.json").write_text('{"name": "theirs", "settings": {}}')
+    before = contents(theirs)
+    for options in ([], ["--force"]):
+        assert prepare(drives, theirs, model, *options) == 1
+        assert "not empty, and not a prepared folder" in capsys.readouterr().err
+    assert contents(theirs) == before
+
+
+def test_force_replaces_what_has_a_damaged_page(
+    tmp_path: Path, drives: Path, model: Path, whole: Contents
+) -> None:
+    page = tmp_path / "whole/dataset.json"
+    page.write_bytes(page.read_bytes()[:200])
+    assert prepare(drives, tmp_path / "whole", model) == 1
+    assert prepare(drives, tmp_path / "whole", model, "--force") == 0
+    assert contents(tmp_path / "whole") == whole
+
+
 def spoil(drives: Path, number: int) -> Path:
     """Cut a scenario short."""
     path = drives / f"USA_Peach-{number}_8_T-1.xml.gz"
@@ -366,6 +392,40 @@ def test_named_groups_are_held_out(
     assert "going on       5 of 5" in capsys.readouterr().out
     sides = [entry.split for entry in open_data(out, CONTRACT).recordings]
     assert sides == ["val", "train", "train", "train", "val"]
+
+
+@pytest.mark.parametrize(
+    ("options", "held_out"),
+    [
+        ([], ["USA_Peach-2_1_T-1"]),
+        (["--seed", "0", "--held-out", "0"], []),
+        (["--held-out-groups", "names.txt"], ["USA_Peach-4_8_T-1"]),
+    ],
+)
+def test_what_the_configuration_holds_out_is_held_out_unless_an_option_says_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], held_out: list[str]
+) -> None:
+    """So `eqrt eval --split val` measures on what is not trained on."""
+    monkeypatch.chdir(tmp_path)
+    Path("names.txt").write_text("USA_Peach-4")
+    Path("data").mkdir()
+    for scenario in DATA:
+        shutil.copy(scenario, "data")
+    config = tiny_file(tmp_path, ('["USA_Peach-2"]', '["USA_Peach-2", "of-another-dataset"]'))
+    words = ["prepare", "data", "--out", "out", "--config", str(config), "--jobs", "1"]
+    assert main([*words, *options]) == 0
+    store = open_data(Path("out"), tiny().model.scene.contract("tiny", "0.0.0"))
+    assert [entry.name for entry in store.recordings if entry.split == "val"] == held_out
+
+
+def test_a_dataset_of_which_the_configuration_holds_nothing_out_is_all_trained_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["prepare", str(DATA[0]), "--out", str(tmp_path / "out"), "--jobs", "1"]
+    assert main([*words, "--config", str(tiny_file(tmp_path))]) == 0
+    said = capsys.readouterr().out
+    assert "recordings     1: 1 train, 0 val" in said
+    assert "one side of the split is empty; as the configuration's held_out has it" in said
 
 
 def test_a_can_log_is_prepared_through_the_service(

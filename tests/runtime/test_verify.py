@@ -64,7 +64,7 @@ def failed(report: Report) -> set[str]:
 def test_our_own_artifacts_are_verified(folder: Path) -> None:
     report = verify(folder)
     assert report.verified, render(report)
-    assert render(report).endswith("verified: all 15 checks passed (seed 1)")
+    assert render(report).endswith("verified: all 16 checks passed (seed 1)")
 
 
 def test_an_artifact_that_others_made_for_the_contract_is_verified(handmade: Path) -> None:
@@ -98,6 +98,11 @@ def test_verifying_needs_neither_torch_nor_onnx() -> None:
         ("batch", "batch", r"in a batch of \d+: trajectories differ by"),
         ("second agent", "order of neighbours", r"trajectories differ by .* m, allowed 0.001"),
         ("first line", "order of lines", r"trajectories differ by .* m, allowed 0.001"),
+        (
+            "measured",
+            "heading",
+            r"heading 210 degrees: trajectories differ by .* m, allowed 0.001",
+        ),
         ("unmasked", "padding", r"nan under False masks changes the prediction, allowed is no bit"),
         ("not finite", "finite", "standing: trajectories are not finite"),
         ("random", "determinism", "the second run differs from the first, allowed is no bit"),
@@ -366,7 +371,7 @@ def test_the_command_prints_a_table_and_a_verdict(
     assert run(str(handmade), "--json", str(tmp_path / "report.json")) == 0
     printed = capsys.readouterr().out
     assert "\nequivariance         ok" in printed
-    assert printed.endswith("verified: all 15 checks passed (seed 1)\n")
+    assert printed.endswith("verified: all 16 checks passed (seed 1)\n")
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["verified"] is True
     assert {check["result"] for check in report["checks"]} == {"ok", "note"}
@@ -377,7 +382,7 @@ def test_the_status_is_1_if_anything_failed(
 ) -> None:
     a_file_too_many(handmade)
     assert run(str(handmade), "--json", str(tmp_path / "report.json")) == 1
-    assert "NOT VERIFIED: 1 of 15 checks failed" in capsys.readouterr().out
+    assert "NOT VERIFIED: 1 of 16 checks failed" in capsys.readouterr().out
     assert json.loads((tmp_path / "report.json").read_text())["verified"] is False
 
 

@@ -382,7 +382,6 @@ def test_points_of_a_line_may_come_in_any_place_but_say_which_way_it_leads(
         ({"heading": "north"}, "heading is 'north', expected one of one_step, robust"),
         ({"frame": "map"}, "frame is 'map', expected one of translated, rotated"),
         ({"tokens": "pixel"}, "tokens is 'pixel', expected one of line, point"),
-        ({"uncertainty": "no"}, "uncertainty is 'no', expected true or false"),
     ],
 )
 def test_a_choice_that_there_is_not_is_named(setting: dict[str, Any], said: str) -> None:

@@ -418,12 +418,12 @@ def test_the_parameters_in_the_documentation_are_the_networks() -> None:
 def test_an_unknown_choice_is_named(field: str, value: str) -> None:
     changes: dict[str, Any] = {field: value}
     with pytest.raises(ValueError, match=f"{field} is '{value}', expected one of"):
-        EqMotion(SCENE, replace(EQMOTION, **changes))
+        replace(EQMOTION, **changes)
 
 
 def test_heads_must_divide_the_token_width() -> None:
-    with pytest.raises(ValueError, match="64 is not a multiple of 12 heads"):
-        EqMotion(SCENE, replace(EQMOTION, heads=12, token_width=64))
+    with pytest.raises(ValueError, match="token_width is 64, expected a multiple of heads, 12"):
+        replace(EQMOTION, map="transformer", heads=12, token_width=64)
 
 
 def test_every_field_of_the_configuration_is_in_the_files() -> None:

@@ -6,12 +6,14 @@ import json
 import os
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from eqrt.core.errors import EqrtError
 from eqrt.training.checkpoint import read_tensors, write_tensors
+from eqrt.training.sampling import Pool
 from eqrt.training.train import train
 from eqrt.training.training_data import TrainingData
 from processes import EQRT, PATIENCE_S, environment
@@ -134,6 +136,17 @@ def test_the_state_of_other_data_is_refused(begun: Path) -> None:
     other = TrainingData(tiny_data().pool.of(held_out), held_out, tiny_data().source)
     with pytest.raises(EqrtError, match=r"another data: checksum .* there"):
         train(tiny().with_steps(2), other, begun, resume=True)
+
+
+def test_the_state_of_as_many_other_windows_is_refused(tmp_path: Path) -> None:
+    """The same rows and weights; everybody goes the other way."""
+    config, windows = tiny().with_steps(2), tiny_data().held_out
+    data = TrainingData(Pool.of(windows), windows, tiny_data().source)
+    train(config, data, tmp_path)
+    other = replace(data, pool=Pool.of(replace(windows, future=-windows.future)))
+    with pytest.raises(EqrtError, match=r"another data: content \(\d+ there, \d+ here\)"):
+        train(config, other, tmp_path, resume=True)
+    assert train(config, data, tmp_path, resume=True).step == 2
 
 
 def test_a_damaged_state_is_refused_in_one_line(begun: Path) -> None:

@@ -458,15 +458,18 @@ def test_a_wrong_option_is_a_usage_error(
     assert option[0] in capsys.readouterr().err
 
 
-def test_the_source_says_whose_it_is(town: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("license_", "sold"), [("CC-BY-4.0", True), ("CC BY-NC 4.0", False)])
+def test_the_source_says_whose_it_is_and_whether_it_may_be_sold(
+    town: Path, tmp_path: Path, license_: str, sold: bool
+) -> None:
     out = tmp_path / "out"
-    terms = ["--credit", "The town is ours.", "--license", "CC-BY-4.0"]
+    terms = ["--credit", "The town is ours.", "--license", license_]
     few = ["--recordings", "1", "--seconds", "5", "--warmup", "40", "--scale", "1.0"]
     assert main(["simulate", str(town), "--out", str(out), *terms, *few]) == 0
     source = RecordingFileReader.open(out).source
     assert source.name == "SUMO town"
-    assert source.license == "CC-BY-4.0"
+    assert source.license == license_
     assert source.credits.endswith("on the scenarios: town. The town is ours.")
-    assert not source.non_commercial
+    assert source.non_commercial == (not sold)
     with np.load(next(out.glob("*.npz"))) as archive:
         assert json.loads(archive["texts"].tobytes())["track_ids"]

@@ -64,6 +64,12 @@ def test_holding_out_what_is_not_there_is_an_error_that_names_it() -> None:
         Split(held_out=("a", "d1")).sides([("a1", "a")])
 
 
+def test_what_is_held_out_elsewhere_is_not_missed_here() -> None:
+    split = Split(held_out=("a", "d1"), others_elsewhere=True)
+    assert split.sides([("a1", "a"), ("b1", "b")]) == ["val", "train"]
+    assert split.sides([("b1", "b")]) == ["train"]
+
+
 def test_a_share_is_between_0_and_1() -> None:
     with pytest.raises(ValueError, match=r"1\.5, expected 0 to 1"):
         Split(held_out_share=1.5)

@@ -10,6 +10,7 @@ import torch
 from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.training.checkpoint import load_checkpoint, read_tensors
+from eqrt.training.dataset.split import group_digest
 from eqrt.training.start import open_start
 from eqrt.training.train import train
 from tiny_training import DATA, tiny, tiny_data, tiny_file
@@ -66,6 +67,8 @@ def test_the_licence_of_the_data_behind_the_start_counts_too(
     assert "NGSIM" in card.data
     assert "Argoverse" in card.data
     assert f"--from {first / MODEL}" in card.command
+    groups = {("Argoverse 1", str(number)) for number in (2, 3, 4)} | {("NGSIM", "USA_Peach-4")}
+    assert set(card.trained_on) == {group_digest(*group) for group in groups}
 
 
 def test_going_on_without_the_start_that_it_had_is_refused(trained: Path, tmp_path: Path) -> None:

@@ -12,8 +12,11 @@ import torch
 
 from eqrt.cli import main
 from eqrt.core.errors import EqrtError
+from eqrt.export.model_card import model_card
 from eqrt.training.checkpoint import load_checkpoint
+from eqrt.training.compare import Run, curve
 from eqrt.training.configuration import TrainConfig, load_config
+from eqrt.training.dataset.split import group_digest
 from eqrt.training.dataset.store import open_data
 from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity, predict
 from eqrt.training.networks.registry import build_network
@@ -21,7 +24,7 @@ from eqrt.training.recorder import MODEL_FILE
 from eqrt.training.sampling import Pool
 from eqrt.training.state import new_optimizer, new_state, update_average
 from eqrt.training.train import learning_rate, train, train_step
-from eqrt.training.training_data import TrainingData
+from eqrt.training.training_data import TrainingData, open_training_data
 from source_tree import ROOT
 from tiny_training import DATA, NGSIM, TOML, tiny, tiny_data, tiny_file
 from window_samples import packed_scenes
@@ -73,6 +76,7 @@ def test_the_command_writes_a_checkpoint_that_says_where_it_comes_from(
     assert "NGSIM" in card.data
     assert card.license == "CC-BY-SA-4.0"
     assert not card.non_commercial
+    assert card.trained_on == (group_digest("NGSIM", "USA_Peach-4"),)  # the other is held out
     assert card.metrics.keys() == card.baseline.keys()
     assert card.metrics["fde_3s"] > 0.0
     assert (card.steps, card.seed) == (4, 1)
@@ -90,6 +94,20 @@ def test_the_checkpoint_predicts_what_was_evaluated(tmp_path: Path) -> None:
     checkpoint = load_checkpoint(tmp_path / "out" / "model.safetensors")
     again = evaluate(checkpoint.network, tiny_data().held_out, checkpoint.config.scene.dt_s)
     assert again == checkpoint.card.metrics
+
+
+@pytest.mark.parametrize(("steps", "end"), [(15, "1.5s"), (40, "4s")])
+def test_any_horizon_is_trained_and_measured_up_to_its_end(
+    tmp_path: Path, steps: int, end: str
+) -> None:
+    config = tiny({"scene": {"horizon_steps": steps}}).with_steps(2)
+    train(config, open_training_data(config, DATA), tmp_path)
+    card = load_checkpoint(tmp_path / MODEL_FILE).card
+    assert list(card.metrics)[-2:] == list(card.baseline)[-2:] == [f"ade_{end}", f"fde_{end}"]
+    assert (tmp_path / "errors.png").exists()
+    assert f"| FDE {end[:-1]} s | " in model_card(config.model.contract("x", "1.0.0"), card, 0.0)
+    figure = curve([Run("x", card)])
+    assert figure.axes[1].get_ylabel().startswith(f"FDE {end[:-1]} s")
 
 
 def test_metrics_stand_in_a_line_per_evaluation_and_in_pictures(tmp_path: Path) -> None:
@@ -131,6 +149,19 @@ def test_a_folder_with_a_training_in_it_is_not_overwritten(
     assert main(words) == 2
     assert "--resume" in capsys.readouterr().err
     assert (tmp_path / "out" / "model.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize("more", [[], ["--resume"]])
+def test_a_model_whose_state_is_gone_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str]
+) -> None:
+    model = tmp_path / "out/model.safetensors"
+    model.parent.mkdir()
+    model.write_bytes(b"weeks of work")
+    arguments = ["train", "--config", str(tiny_file(tmp_path)), "--data", str(DATA[0])]
+    assert main([*arguments, "--out", str(tmp_path / "out"), *more]) == 2
+    assert "holds model.safetensors and no state.safetensors" in capsys.readouterr().err
+    assert model.read_bytes() == b"weeks of work"
 
 
 def test_held_out_recordings_that_are_not_there_are_named(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.training.configuration import DataConfig
 from eqrt.training.dataset.windows import MIN_DRIVE_M
@@ -80,6 +82,43 @@ def test_several_datasets_are_trained_on_together_and_each_is_measured_its_own_w
     assert data.source.non_commercial
     assert "NGSIM" in data.source.name
     assert 0 < data.held_out.focal.sum() < len(data.held_out)
+
+
+def folder_of(folder: Path, *names: str) -> Path:
+    """The recording DATA[0] under other names, as scenarios of NGSIM's."""
+    folder.mkdir()
+    for name in names:
+        shutil.copy(DATA[0], folder / f"{name}.xml.gz")
+    return folder
+
+
+@pytest.mark.parametrize("held_out", ["USA_US101-21_2_T-1", "USA_US101-21"])
+def test_what_is_held_out_takes_its_group_along_in_every_dataset(
+    tmp_path: Path, held_out: str
+) -> None:
+    """US-101's numbers 21 and 22 overlap in time: the same vehicles, under two names."""
+    one = folder_of(tmp_path / "one", "USA_Peach-4_8_T-1", "USA_US101-21_2_T-1")
+    other = folder_of(tmp_path / "other", "USA_US101-22_4_T-1", "USA_Peach-5_1_T-1")
+    data = opened(one, DataConfig(stride=5, held_out=(held_out,)), other)
+    trained_on = set(data.pool.gather(np.arange(len(data.pool))).recording)
+    assert trained_on == {0, 2}  # by name, one folder after the other
+    assert data.recordings == 2
+
+
+def test_a_group_that_two_splits_put_on_both_sides_is_refused(tmp_path: Path) -> None:
+    """Each dataset was split by itself, by other seeds."""
+    data = folder_of(tmp_path / "raw", "USA_Peach-4_8_T-1", "USA_Peach-5_1_T-1")
+    contract = tiny().model.scene.contract("tiny", "0.0.0")
+    for name, held_out in (("one", "USA_Peach-4"), ("other", "USA_Peach-5")):
+        (tmp_path / f"{name}.txt").write_text(held_out)
+        (tmp_path / "contract.json").write_text(contract.to_json())
+        words = ["prepare", str(data), "--out", str(tmp_path / name), "--model", str(tmp_path)]
+        words += ["--held-out-groups", str(tmp_path / f"{name}.txt"), "--jobs", "1"]
+        assert main(words) == 0
+    with pytest.raises(EqrtError, match="group USA_Peach-4 is held out in one dataset and trained"):
+        opened(tmp_path / "one", DataConfig(), tmp_path / "other")
+    with pytest.raises(EqrtError, match="nothing to train on"):
+        opened(tmp_path / "one", DataConfig(held_out=("USA_Peach-4", "USA_Peach-5")))
 
 
 def test_without_names_the_datas_own_split_counts(scenes: Path) -> None:

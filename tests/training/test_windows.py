@@ -88,9 +88,17 @@ def test_a_heading_that_nobody_measured_is_zero() -> None:
     np.testing.assert_allclose(windows.heading, [[0.0, 0.0], [0.0, 1.0]], atol=1e-7)
 
 
-def test_the_dataset_says_when_now_is_unless_a_stride_is_asked_for() -> None:
+def test_the_dataset_says_when_now_is_and_a_stride_adds_more() -> None:
     assert set(cut(drive(1)).step) == {19}
-    assert sorted(set(cut(drive(1), stride=10).step)) == [1, 11, 21, 31]
+    assert sorted(set(cut(drive(1), stride=10).step)) == [1, 11, 19, 21, 31]
+    assert sorted(set(cut(drive(1), stride=6).step)) == [1, 7, 13, 19, 25, 31, 37]
+
+
+@pytest.mark.parametrize("stride", [None, 2, 5, 6, 10])
+def test_whatever_the_stride_a_scene_as_long_as_history_and_future_is_complete_once(
+    stride: int | None,
+) -> None:
+    assert cut(drive(1), stride=stride).complete().step.tolist() == [19]
 
 
 def test_targets_are_the_datasets_own_the_complete_ones_or_all() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -20,7 +19,8 @@ from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.core.scene import Scene
 from eqrt.export.changelog import changelog
-from eqrt.export.model_card import model_card
+from eqrt.export.model_card import TRAINED_ON, model_card
+from eqrt.export.place import SUMS, claim, put
 from eqrt.export.to_onnx import to_onnx
 from eqrt.export.vectors import TURNED, TWINS, named_scenes
 from eqrt.runtime.prediction.predictor import Predictor, disagreement
@@ -45,13 +45,15 @@ def write_artifact(
     *,
     translate: Translate = to_onnx,
 ) -> float:
-    """Export `model`, verify it, and put it at `folder` (replacing an artifact there).
+    """Export `model`, verify it, and put it at `folder`, replacing an artifact there.
 
     `changes` says what is new in this version (`eqrt.export.changelog`). Returns the largest
     disagreement between PyTorch and the file in metres. Raises EqrtError if that is above
-    AGREEMENT_M or the runtime's own Predictor refuses the result, ValueError if the model's outputs
-    are not the contract's.
+    AGREEMENT_M, the runtime's own Predictor refuses the result, or something else than an artifact
+    is at `folder`; ValueError if the model's outputs are not the contract's.
     """
+    folder = folder.resolve()
+    claim(folder)
     log = changelog(folder, contract.version, changes)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
@@ -69,13 +71,14 @@ def write_artifact(
         text = model_card(contract, card, _turned_apart_m(expected))
         (draft / "README.md").write_text(text, encoding="utf-8")
         (draft / "CHANGELOG.md").write_text(log, encoding="utf-8")
+        if card.trained_on:
+            groups = "".join(f"{group}\n" for group in card.trained_on)
+            (draft / TRAINED_ON).write_text(groups, encoding="utf-8")
         for index, (name, scene) in enumerate(scenes.items()):
             _write_vector(scene, expected[name], draft / f"test_data_set_{index}", name)
         _write_checksums(draft)
         error = _read_back(draft, scenes, expected)
-        if folder.exists():
-            shutil.rmtree(folder)
-        draft.rename(folder)
+        put(draft, folder)
     return error
 
 
@@ -132,7 +135,7 @@ def _write_checksums(folder: Path) -> None:
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(folder).as_posix()}\n"
         for path in files
     ]
-    (folder / "SHA256SUMS").write_text("".join(lines), encoding="utf-8")
+    (folder / SUMS).write_text("".join(lines), encoding="utf-8")
 
 
 def _turned_apart_m(expected: Mapping[str, Tensors]) -> float:

@@ -48,6 +48,7 @@ from eqrt.runtime.prediction.tiles import Tile, load_tile
 from eqrt.runtime.replay import replay
 from eqrt.runtime.tracking.track_history import MAX_GAP_S, SAME_TIME_S
 from eqrt.runtime.tracking.tracks import Tracks, TrackStore
+from eqrt.training.recordings.formats import forbids_commerce
 from eqrt.training.recordings.recording import Part, Recording, Source, TrackGrid
 
 RECORDERS_OWN = "the recorder's own"
@@ -87,12 +88,12 @@ class CanLogReader:
 
     @property
     def source(self) -> Source:
-        """What its owner says about the logs; a licence with NC in its name is non-commercial."""
+        """What its owner says about the logs."""
         return Source(
             name="CAN logs",
             credits=self.credits,
             license=self.license,
-            non_commercial="NC" in self.license.upper().split("-"),
+            non_commercial=forbids_commerce(self.license),
         )
 
     def parts(self, path: Path) -> Sequence[Part]:

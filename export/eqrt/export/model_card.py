@@ -7,6 +7,9 @@ import re
 from eqrt.core.contract import ModelContract
 from eqrt.training.checkpoint import Card
 
+TRAINED_ON = "trained_on.txt"
+"""Beside the card: `Card.trained_on`, a group per line, for `eqrt eval` to say when it measures on
+one of them."""
 EQUIVARIANT_M = 5e-3
 """What turning a scene 500 m away may change by float32's rounding."""
 
@@ -71,7 +74,7 @@ def _what_counts(contract: ModelContract) -> str:
 
 def _metric(name: str) -> str:
     """How a table calls a metric: `ade_3s` is ADE 3 s."""
-    if of_mean := re.fullmatch(r"(ade|fde)_(\d+)s", name):
+    if of_mean := re.fullmatch(r"(ade|fde)_([\d.]+)s", name):
         return f"{of_mean[1].upper()} {of_mean[2]} s"
     if ellipse := re.fullmatch(r"inside_(\d+)", name):
         return f"truth inside the {ellipse[1]} % ellipse, share"

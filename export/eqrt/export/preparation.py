@@ -169,11 +169,17 @@ def _report(folder: Path, contract: ModelContract) -> None:
     print(f"windows        {len(store)}: {train} train, {val} val")
     print(f"size           {size / 1e6:.1f} MB in {totals.shards} shards")
     if not (train and val):
-        print("one side of the split is empty; few groups: name some with --held-out-groups")
+        print(f"one side of the split is empty; {_why_empty(settings.split)}")
     if totals.skipped:
         _report_skipped(folder, totals.skipped)
     if notice := license_notice(settings.source):
         print(notice)
+
+
+def _why_empty(split: Split) -> str:
+    if split.others_elsewhere:
+        return "as the configuration's held_out has it"
+    return "few groups: name some with --held-out-groups"
 
 
 def _report_skipped(folder: Path, skipped: int) -> None:

@@ -7,6 +7,7 @@ are not made again, so a run that was cut short goes on where it was.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from eqrt.core.contract import ModelContract
@@ -14,7 +15,7 @@ from eqrt.core.errors import ContractError, UsageError
 from eqrt.export.cluster import add_worker_arguments
 from eqrt.export.formats import FORMATS, add_reader_arguments
 from eqrt.export.preparation import prepare
-from eqrt.training.configuration import load_config
+from eqrt.training.configuration import TrainConfig, load_config
 from eqrt.training.dataset.pieces import RawData
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.windows import TARGETS, WindowOptions
@@ -60,13 +61,11 @@ def _add_split_arguments(parser: argparse.ArgumentParser) -> None:
     split.add_argument(
         "--held-out",
         type=_share,
-        default=0.2,
         metavar="SHARE",
-        help="of the groups of recordings, drawn (default %(default)s)",
+        help="of the groups of recordings, drawn (default: those that the configuration names; "
+        "where it names none, 0.2)",
     )
-    split.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="of the draw (default %(default)s)"
-    )
+    split.add_argument("--seed", type=int, metavar="N", help="of the draw (default 0)")
     split.add_argument(
         "--held-out-groups",
         type=Path,
@@ -90,7 +89,8 @@ def _add_reader_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prepare, and say what came of it."""
-    contract, options = _wanted(args)
+    config = None if args.config is None else load_config(args.config)
+    contract, options = _wanted(args, config)
     data = RawData.open(
         args.data,
         contract,
@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     prepare(
         data,
         args.out.absolute(),
-        _split(args),
+        _split(args, config),
         keep_going=args.keep_going,
         force=args.force,
         jobs=args.jobs,
@@ -119,12 +119,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _wanted(args: argparse.Namespace) -> tuple[ModelContract, WindowOptions]:
+def _wanted(
+    args: argparse.Namespace, config: TrainConfig | None
+) -> tuple[ModelContract, WindowOptions]:
     """For which model, and which windows."""
-    if args.config is None:
+    if config is None:
         contract = _contract(args.model)
         return contract, WindowOptions(stride=args.stride, targets=args.targets or "all")
-    config = load_config(args.config)
     usual = config.data.window_options() or WindowOptions()
     options = WindowOptions(
         stride=args.stride or usual.stride, targets=args.targets or usual.targets
@@ -142,12 +143,16 @@ def _contract(folder: Path) -> ModelContract:
         ) from error
 
 
-def _split(args: argparse.Namespace) -> Split:
-    return Split(
-        seed=args.seed,
-        held_out_share=args.held_out,
-        held_out=_lines(args.held_out_groups) if args.held_out_groups else (),
+def _split(args: argparse.Namespace, config: TrainConfig | None) -> Split:
+    """As the options say; without any, as training with the configuration will split it."""
+    said = {"seed": args.seed, "held_out_share": args.held_out}
+    drawn = replace(Split(), **{name: value for name, value in said.items() if value is not None})
+    if args.held_out_groups:
+        return replace(drawn, held_out=_lines(args.held_out_groups))
+    named = (
+        () if config is None or any(v is not None for v in said.values()) else config.data.held_out
     )
+    return replace(drawn, held_out=named, others_elsewhere=True) if named else drawn
 
 
 def _lines(path: Path) -> tuple[str, ...]:

@@ -63,10 +63,10 @@ class ModelContract:
 
     def __post_init__(self) -> None:
         for name in _SIZES:
-            if not 1 <= getattr(self, name) <= _MAX_SIZE:
+            if not 1 <= getattr(self, name) <= MAX_SIZE:
                 raise ContractError(
                     f"model contract: {name} is {getattr(self, name)}, "
-                    f"expected 1 to {_MAX_SIZE}; re-export the model"
+                    f"expected 1 to {MAX_SIZE}; re-export the model"
                 )
         if not 0.0 < self.dt_s <= 1.0:
             raise ContractError(f"model contract: dt_s is {self.dt_s}, expected above 0 to 1 s")
@@ -146,7 +146,8 @@ _SIZES = (
     "horizon_steps",
     "num_modes",
 )
-_MAX_SIZE = 1024  # far above any sensible model, low enough that a bad file cannot exhaust memory
+MAX_SIZE = 1024
+"""Of an axis: far above any sensible model, low enough that a bad file cannot exhaust memory."""
 
 
 def _typed(values: Mapping[str, object], name: str, where: str) -> object:

@@ -14,11 +14,15 @@ of it within m is 1 - (1 + m) exp(-m).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
 
+SECONDS = (1.0, 2.0, 3.0)
+"""The times that the field gives errors for."""
 MISS_M = 2.0
 """A best mode that ends farther than this from the truth has missed it."""
 
@@ -34,6 +38,12 @@ def displacement(trajectories: Float64, truth: Float64) -> Float64:
     return np.asarray(np.linalg.norm(trajectories - truth, axis=-1))
 
 
+def horizons_s(dt_s: float, horizon_steps: int) -> tuple[float, ...]:
+    """The times that errors are given for: 1, 2, 3 s as far as they go, and the horizon's end."""
+    end = round(horizon_steps * dt_s, 6)
+    return (*(seconds for seconds in SECONDS if seconds < end), end)
+
+
 def average_displacement(distance: Float64, steps: int) -> float:
     """ADE in metres over the first `steps` of distances (B, H)."""
     return float(distance[:, :steps].mean())
@@ -45,14 +55,20 @@ def final_displacement(distance: Float64, steps: int) -> float:
 
 
 def error_table(
-    distance: Float64, dt_s: float, seconds: tuple[int, ...] = (1, 2, 3)
+    distance: Float64, dt_s: float, seconds: Sequence[float] | None = None
 ) -> dict[str, float]:
-    """`{"ade_1s": ..., "fde_1s": ..., ...}` in metres for distances (B, H)."""
+    """`{"ade_1s": ..., "fde_1s": ..., ...}` in metres for distances (B, H).
+
+    At `seconds`, ascending; None = `horizons_s`. Raises ValueError for one beyond the horizon.
+    """
+    horizon_steps = distance.shape[1]
     table: dict[str, float] = {}
-    for horizon_s in seconds:
+    for horizon_s in horizons_s(dt_s, horizon_steps) if seconds is None else seconds:
         steps = round(horizon_s / dt_s)
-        table[f"ade_{horizon_s}s"] = average_displacement(distance, steps)
-        table[f"fde_{horizon_s}s"] = final_displacement(distance, steps)
+        if not 1 <= steps <= horizon_steps:
+            raise ValueError(f"no error at {horizon_s:g} s: {horizon_steps} steps of {dt_s:g} s")
+        table[f"ade_{horizon_s:g}s"] = average_displacement(distance, steps)
+        table[f"fde_{horizon_s:g}s"] = final_displacement(distance, steps)
     return table
 
 

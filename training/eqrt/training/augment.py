@@ -9,9 +9,13 @@ is for the others.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import torch
 from torch import Tensor
+
+from eqrt.training.tables import NotNegative, Share
 
 Batch = dict[str, Tensor]
 
@@ -25,43 +29,43 @@ WANDER_STEPS = 15.0
 class AugmentConfig:
     """Probabilities per window unless said otherwise; what is not given does not happen."""
 
-    rotated: float = 0.0
+    rotated: Share = 0.0
     """The whole scene, about the target, by any angle. An equivariant network cannot tell."""
-    mirrored: float = 0.0
+    mirrored: Share = 0.0
     """The whole scene, as if seen in a mirror: traffic that keeps to the other side."""
-    scaled: float = 0.0
+    scaled: Share = 0.0
     """The whole scene, lanes and future too, is made larger or smaller: other speeds."""
-    max_scale: float = 1.0
+    max_scale: Annotated[float, msgspec.Meta(ge=1.0)] = 1.0
     """The largest factor; the smallest is its inverse."""
-    parked: float = 0.0
+    parked: Share = 0.0
     """The target has always stood where it is, and stays."""
-    standing: float = 0.0
+    standing: Share = 0.0
     """So has everybody: a queue."""
-    clutter: float = 0.0
+    clutter: Share = 0.0
     """Per neighbour: it is a thing beside the road that has never moved."""
-    wander_m: float = 0.0
+    wander_m: NotNegative = 0.0
     """Standard deviation of how far the sensor's point on a thing that stands moves about: its
     reflection runs along a wall. Each thing draws its own below it."""
-    ghost: float = 0.0
+    ghost: Share = 0.0
     """Per neighbour: it is a second reflection of the target, within some metres."""
-    alone: float = 0.0
+    alone: Share = 0.0
     """Every neighbour is hidden."""
-    short_history: float = 0.0
+    short_history: Share = 0.0
     """The target and its neighbours were first seen only some steps ago."""
-    missing_step: float = 0.0
+    missing_step: Share = 0.0
     """Per step and agent."""
-    hidden_neighbour: float = 0.0
+    hidden_neighbour: Share = 0.0
     """Per neighbour."""
-    missing_line: float = 0.0
+    missing_line: Share = 0.0
     """Per centerline."""
-    line_offset_m: float = 0.0
+    line_offset_m: NotNegative = 0.0
     """Standard deviation, of where each centerline lies: maps are not exact."""
-    no_map: float = 0.0
+    no_map: Share = 0.0
     """Every centerline at once."""
-    unknown_heading: float = 0.0
-    heading_noise_rad: float = 0.0
+    unknown_heading: Share = 0.0
+    heading_noise_rad: NotNegative = 0.0
     """Standard deviation."""
-    position_noise_m: float = 0.0
+    position_noise_m: NotNegative = 0.0
     """Standard deviation of the noisiest windows; each window draws its own below it."""
 
 

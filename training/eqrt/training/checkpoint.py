@@ -43,6 +43,8 @@ class Card:
     """How many recordings were trained on; 0 in older cards, which do not say."""
     samples: int = 0
     """Windows trained on, each counted as often as it was drawn; 0 likewise."""
+    trained_on: tuple[str, ...] = ()
+    """The groups of recordings behind these weights (`group_digest`), sorted; empty likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,4 +127,5 @@ def _read_card(text: str) -> Card:
     wrong = sorted((needed - set(values)) | (set(values) - known))
     if wrong:
         raise ValueError(f"the card's fields differ: {', '.join(wrong)}")
+    values["trained_on"] = tuple(values.get("trained_on", ()))
     return Card(**values)

@@ -15,10 +15,9 @@ from matplotlib.figure import Figure
 
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.training.checkpoint import Card, load_checkpoint
-from eqrt.training.plots import FORMATS, save_figure, spoken
+from eqrt.training.plots import FORMATS, end_errors, save_figure, spoken
 from eqrt.training.recorder import MODEL_FILE
 
-_DRAWN = ("ade_3s", "fde_3s")
 _SIZE_INCHES = (9.0, 4.0)
 _CONSTANT_VELOCITY = "constant velocity"
 
@@ -91,7 +90,8 @@ def curve(runs: Sequence[Run]) -> Figure:
                 "train it again with this version of eqrt"
             )
     figure = Figure(_SIZE_INCHES, layout="constrained")
-    for axes, metric in zip(figure.subplots(1, len(_DRAWN)), _DRAWN, strict=True):
+    drawn = end_errors(first.card.baseline)
+    for axes, metric in zip(figure.subplots(1, len(drawn)), drawn, strict=True):
         _draw(axes, runs, metric)
     figure.axes[0].legend(fontsize="small")
     return figure

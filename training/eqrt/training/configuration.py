@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import tomllib
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,10 +21,9 @@ from eqrt.training.augment import AugmentConfig
 from eqrt.training.dataset.windows import WindowOptions
 from eqrt.training.losses import LOSSES
 from eqrt.training.networks.registry import ModelConfig
+from eqrt.training.tables import Count, NotNegative, PartialShare, Positive, check_names, fill
 
 Tables = dict[str, Any]
-Count = Annotated[int, msgspec.Meta(ge=1)]
-Weight = Annotated[float, msgspec.Meta(ge=0.0)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,11 +39,11 @@ class DataConfig:
     train_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
     """Of the groups of recordings that are not held out, how many to train on: how much do fewer
     cost? Drawn by their names, so that a smaller share is part of a larger one."""
-    focal_weight: Weight = 1.0
+    focal_weight: NotNegative = 1.0
     """How often in an epoch a window of the dataset's own targets is drawn, on average."""
-    driving_weight: Weight = 1.0
+    driving_weight: NotNegative = 1.0
     """Likewise one of another target that moves MIN_DRIVE_M or more while it is seen."""
-    standing_weight: Weight = 1.0
+    standing_weight: NotNegative = 1.0
     """Likewise all the rest. Most of recorded traffic is parked, and easy."""
 
     def window_options(self) -> WindowOptions | None:
@@ -59,18 +58,18 @@ class LoopConfig:
     """How the network is trained. Table [train]; either `steps` or `epochs`."""
 
     steps: Count | None = None
-    epochs: Annotated[float, msgspec.Meta(gt=0.0)] | None = None
+    epochs: Positive | None = None
     batch_size: Count
     """Windows per step, those of all processes together."""
     optimizer: Literal["adam", "adamw", "muon"]
-    learning_rate: Annotated[float, msgspec.Meta(gt=0.0)]
-    weight_decay: Weight
+    learning_rate: Positive
+    weight_decay: NotNegative
     """On matrices only: biases and scales are few and mean something."""
     schedule: Literal["cosine", "constant"]
     """Of the learning rate, after the warm-up."""
     warmup_steps: Annotated[int, msgspec.Meta(ge=0)]
-    max_grad_norm: Annotated[float, msgspec.Meta(gt=0.0)]
-    average_decay: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
+    max_grad_norm: Positive
+    average_decay: PartialShare
     """Of the running average of the weights, per step; 0 = no averaging."""
     loss: str
     """A key of `eqrt.training.losses.LOSSES`."""
@@ -107,13 +106,15 @@ class TrainConfig:
     @classmethod
     def from_tables(cls, tables: Tables) -> TrainConfig:
         """Raises ValueError that names the table and what is missing, unknown or wrong in it."""
-        _check_names("top level", set(tables), {"name", *_TABLES}, {"augment"})
+        check_names("top level", set(tables), _NEEDED, _NEEDED | {"augment"})
+        if not isinstance(tables["name"], str):
+            raise ValueError(f"name is {tables['name']!r}, expected a text")
         config = cls(
-            name=_fill(str, tables["name"], "name"),
+            name=tables["name"],
             model=ModelConfig.from_tables(tables["scene"], tables["network"]),
-            data=_fill(DataConfig, tables["data"], "[data]"),
-            train=_fill(LoopConfig, tables["train"], "[train]"),
-            augment=_fill(AugmentConfig, tables["augment"], "[augment]")
+            data=fill(DataConfig, tables["data"], "data"),
+            train=fill(LoopConfig, tables["train"], "train"),
+            augment=fill(AugmentConfig, tables["augment"], "augment")
             if "augment" in tables
             else None,
         )
@@ -143,7 +144,7 @@ class TrainConfig:
         return replace(self, data=replace(self.data, train_share=share))
 
 
-_TABLES = {"scene", "network", "data", "train"}
+_NEEDED = {"name", "scene", "network", "data", "train"}
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -168,22 +169,6 @@ def differences(there: Tables, here: Tables) -> list[str]:
         for name in sorted(one | other)
         if one.get(name) != other.get(name)
     ]
-
-
-def _fill(kind: type[Any], values: object, where: str) -> Any:
-    if kind is not str and isinstance(values, dict):
-        known = {field.name for field in fields(kind)}
-        _check_names(where, set(values), set(), known)
-    try:
-        return msgspec.convert(values, kind)
-    except (msgspec.ValidationError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from error
-
-
-def _check_names(where: str, found: set[str], needed: set[str], optional: set[str]) -> None:
-    wrong = sorted((needed - found) | (found - needed - optional))
-    if wrong:
-        raise ValueError(f"{where} has missing or unknown fields: {', '.join(wrong)}")
 
 
 def _given(config: DataConfig | LoopConfig) -> Tables:

@@ -41,10 +41,10 @@ class Predicted:
 def evaluate(network: nn.Module, windows: Windows, dt_s: float) -> dict[str, float]:
     """Errors over complete windows.
 
-    ADE/FDE at 1, 2, 3 s of the most probable mode, and if there are more also the best mode's
-    `min_ade`, `min_fde` (metres) and `miss_rate` (0 to 1), at the horizon. Of a network that
-    predicts covariances also `nll` (nats), `inside_50` and `inside_90` (0 to 1) there: how well it
-    knows its errors (`eqrt.core.metrics.calibration`).
+    ADE/FDE of the most probable mode at 1, 2, 3 s and the horizon's end (`horizons_s`), and if
+    there are more also the best mode's `min_ade`, `min_fde` (metres) and `miss_rate` (0 to 1), at
+    the end. Of a network that predicts covariances also `nll` (nats), `inside_50` and `inside_90`
+    (0 to 1) there: how well it knows its errors (`eqrt.core.metrics.calibration`).
     """
     complete = _complete(windows)
     predicted = predict(network, complete)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from eqrt.training.progress import Numbers, read_lines
 
 FORMATS = ("png", "svg")
-_ERRORS = ("ade_3s", "fde_3s", "min_ade", "min_fde")
+_BEST = ("min_ade", "min_fde")
 _SIZE_INCHES = (7.0, 4.0)
 _SPREAD = 20.0  # above this ratio of largest to smallest a logarithmic axis shows more
 
@@ -25,8 +26,8 @@ def plot_metrics(log: Path, folder: Path, baseline: Numbers) -> list[Path]:
     written = []
     if lines:
         written += _save(_figure(lines, ["loss"], {}, "loss"), folder / "loss")
-    if evaluated := [line for line in lines if "ade_3s" in line]:
-        names = [name for name in _ERRORS if name in evaluated[0]]
+    if evaluated := [line for line in lines if end_errors(line)]:
+        names = [*end_errors(evaluated[0]), *(name for name in _BEST if name in evaluated[0])]
         figure = _figure(evaluated, names, baseline, "metres, held-out targets")
         written += _save(figure, folder / "errors")
     return written
@@ -59,6 +60,12 @@ def _figure(
     if len(names) > 1 or baseline:
         axes.legend(fontsize="small")
     return figure
+
+
+def end_errors(table: Mapping[str, float]) -> list[str]:
+    """ADE and FDE at the longest time of a table of errors: `ade_3s`, `fde_3s`; none in others."""
+    times = [float(found[1]) for name in table if (found := re.fullmatch(r"ade_([\d.]+)s", name))]
+    return [f"{kind}_{max(times):g}s" for kind in ("ade", "fde")] if times else []
 
 
 def spoken(name: str) -> str:

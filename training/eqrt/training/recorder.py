@@ -55,6 +55,7 @@ class Recorder:
         self._watch = Stopwatch()
         self._seen = state.step
         if ranks.leads:
+            self._fingerprint = goal.fingerprint()
             self._log = MetricsLog(goal.out / METRICS_FILE, after=state.step)
             scene, held_out = goal.config.model.scene, goal.data.held_out
             self._baseline = evaluate_constant_velocity(held_out, scene.num_modes, scene.dt_s)
@@ -89,7 +90,7 @@ class Recorder:
         self._meter.settle(self._state)
         if self._ranks.leads:
             goal = self._goal
-            save_state(goal.out / STATE_FILE, self._state, goal.config, goal.fingerprint())
+            save_state(goal.out / STATE_FILE, self._state, goal.config, self._fingerprint)
 
     def plot(self) -> None:
         """Draw the metrics so far."""
@@ -132,6 +133,7 @@ class Recorder:
     def _card(self, metrics: dict[str, float]) -> Card:
         config, data = self._goal.config, self._goal.data
         source = credited(data.source, self._goal.start)
+        before = () if self._goal.start is None else self._goal.start.trained_on
         return Card(
             name=config.name,
             data=source.credits,
@@ -146,6 +148,7 @@ class Recorder:
             seed=config.train.seed,
             recordings=data.recordings,
             samples=self._state.step * config.train.batch_size,
+            trained_on=tuple(sorted({*data.trained_on, *before})),
         )
 
 

@@ -35,6 +35,9 @@ class WindowSource(Protocol):
     def gather(self, rows: Rows) -> Windows:
         """The windows `rows`, in this order, copied."""
 
+    def checksum(self) -> int:
+        """The same for the same windows, and hardly ever for others. Takes no reading of all."""
+
 
 @dataclass(frozen=True, slots=True)
 class InMemory:
@@ -45,6 +48,10 @@ class InMemory:
     def gather(self, rows: Rows) -> Windows:
         """Copies of the windows `rows`."""
         return self.windows.select(rows)
+
+    def checksum(self) -> int:
+        """Of all of them."""
+        return self.windows.checksum()
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +82,9 @@ class Pool:
         return self.source.gather(self.rows[members])
 
     def fingerprint(self) -> dict[str, int]:
-        """The same for the same rows and weights, and hardly ever for others."""
+        """The same for the same windows, drawn as often, and hardly ever for others."""
         checksum = zlib.crc32(self.weights.tobytes(), zlib.crc32(self.rows.tobytes()))
-        return {"windows": len(self), "checksum": checksum}
+        return {"windows": len(self), "checksum": checksum, "content": self.source.checksum()}
 
 
 class Sampler:

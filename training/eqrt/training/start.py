@@ -29,6 +29,8 @@ class Start:
     tensors: dict[str, Tensor]
     source: Source
     """Of the data behind them."""
+    trained_on: tuple[str, ...]
+    """Likewise, the groups (`Card.trained_on`)."""
 
     def fingerprint(self) -> dict[str, int]:
         """The same for the same weights, and hardly ever for others."""
@@ -62,7 +64,7 @@ def open_start(path: Path, config: TrainConfig) -> Start:
         license=card.license,
         non_commercial=card.non_commercial,
     )
-    return Start(path, dict(found.network.state_dict()), source)
+    return Start(path, dict(found.network.state_dict()), source, card.trained_on)
 
 
 def credited(data: Source, start: Start | None) -> Source:

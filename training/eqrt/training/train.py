@@ -85,10 +85,7 @@ def run(args: argparse.Namespace) -> int:
     """Train, evaluate, save; 128 + its number after a signal."""
     config = _config(args)
     torch.set_num_threads(args.threads)
-    if (args.out / STATE_FILE).exists() and not args.resume:
-        raise UsageError(
-            f"{args.out}: holds a training already; go on with --resume, or choose another --out"
-        )
+    _check_out(args.out, args.resume)
     with join_ranks(args.device) as ranks:
         data = open_training_data(config, args.data)
         start = None if args.start is None else open_start(args.start, config)
@@ -236,6 +233,19 @@ def _config(args: argparse.Namespace) -> TrainConfig:
             raise UsageError(f"--train-share is {args.train_share}, expected above 0 to 1")
         config = config.with_train_share(args.train_share)
     return config.with_steps(args.steps) if args.steps else config
+
+
+def _check_out(out: Path, resume: bool) -> None:
+    """No training is overwritten."""
+    if (out / STATE_FILE).exists():
+        if not resume:
+            raise UsageError(
+                f"{out}: holds a training already; go on with --resume, or choose another --out"
+            )
+    elif (out / MODEL_FILE).exists():
+        raise UsageError(
+            f"{out}: holds {MODEL_FILE} and no {STATE_FILE} to go on from; choose another --out"
+        )
 
 
 def _introduce(

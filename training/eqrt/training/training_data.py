@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError
 from eqrt.training.configuration import DataConfig, TrainConfig
-from eqrt.training.dataset.split import Split, in_share
+from eqrt.training.dataset.split import TRAIN, VAL, Split, group_digest, in_share
 from eqrt.training.dataset.store import WindowStore, open_data
 from eqrt.training.dataset.windows import MIN_DRIVE_M, Windows, join
 from eqrt.training.recordings.recording import Source
@@ -31,13 +31,15 @@ class TrainingData:
     source: Source
     recordings: int = 0
     """How many the pool's windows come from; 0 = not known."""
+    trained_on: frozenset[str] = frozenset()
+    """The groups that they are of (`group_digest`)."""
 
 
 def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingData:
     """Open prepared folders, or datasets as they are (which are cut into memory).
 
-    Raises EqrtError if there is nothing to train on or nothing to evaluate on, or if something that
-    is to be held out is nowhere.
+    Raises EqrtError if there is nothing to train on or nothing to evaluate on, if something that is
+    to be held out is nowhere, or if what one dataset holds out is trained on in another.
     """
     contract = config.model.scene.contract(config.name, "0.0.0")
     options = config.data.window_options()
@@ -46,6 +48,7 @@ def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingDa
     if config.data.held_out:
         stores = _split(stores, config.data.held_out, where)
     store = WindowStore.concat(stores)
+    _check_sides(store, where)
     rows = _shared(store, store.rows("train"), config.data.train_share)
     if not len(rows):
         raise EqrtError(f"{where}: {_why_none(config.data)}; nothing to train on")
@@ -58,7 +61,8 @@ def open_training_data(config: TrainConfig, paths: Sequence[Path]) -> TrainingDa
         )
     pool = Pool(store, rows, _weights(config.data, store, rows))
     recordings = len(np.unique(store.column("recording")[rows]))
-    return TrainingData(pool, held_out, store.source, recordings)
+    groups = frozenset[str]().union(*(_groups(s, config.data.train_share) for s in stores))
+    return TrainingData(pool, held_out, store.source, recordings, groups)
 
 
 def measured_windows(store: WindowStore, split: str) -> Windows:
@@ -72,17 +76,38 @@ def measured_windows(store: WindowStore, split: str) -> Windows:
 
 
 def _split(stores: Sequence[WindowStore], held_out: Sequence[str], where: str) -> list[WindowStore]:
-    """Hold out what is named, in whichever of the stores it is, and nothing else."""
-    split, found = [], set[str]()
-    for store in stores:
-        names = {name for entry in store.recordings for name in (entry.name, entry.group)}
-        here = tuple(name for name in held_out if name in names)
-        found.update(here)
-        split.append(store.split_by(Split(held_out=here, held_out_share=0.0)))
-    missing = sorted(set(held_out) - found)
+    """Hold out the groups of what is named, in every store, and nothing else.
+
+    A recording that is named in one store takes along those of its group in all of them.
+    """
+    entries = [entry for store in stores for entry in store.recordings]
+    missing = sorted(set(held_out) - {name for e in entries for name in (e.name, e.group)})
     if missing:
         raise EqrtError(f"{where}: held-out recording or group {missing[0]} is not here")
-    return split
+    groups = {entry.group for entry in entries if {entry.name, entry.group} & set(held_out)}
+    return [store.split_by(_holding_out(groups, store)) for store in stores]
+
+
+def _holding_out(groups: set[str], store: WindowStore) -> Split:
+    here = sorted(groups & {entry.group for entry in store.recordings})
+    return Split(held_out=tuple(here), held_out_share=0.0)
+
+
+def _check_sides(store: WindowStore, where: str) -> None:
+    """No group is on both sides: each dataset's own split knows of that dataset only."""
+    sides = [{e.group for e in store.recordings if e.split == side} for side in (TRAIN, VAL)]
+    both = sorted(set.intersection(*sides))
+    if both:
+        raise EqrtError(
+            f"{where}: group {both[0]} is held out in one dataset and trained on in another; name "
+            "what is held out in [data] held_out, or prepare them with the same split"
+        )
+
+
+def _groups(store: WindowStore, share: float) -> set[str]:
+    """Digests of the groups of a dataset that are trained on."""
+    trained = {entry.group for entry in store.recordings if entry.split == TRAIN}
+    return {group_digest(store.source.name, g) for g in trained if in_share(g, share)}
 
 
 def _shared(store: WindowStore, rows: Rows, share: float) -> Rows:

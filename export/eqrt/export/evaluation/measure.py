@@ -72,6 +72,8 @@ class DataCard:
     evaluated: int
     left_out: int
     """Chosen, but with gaps in history or future."""
+    trained_on: int
+    """Of the recordings; by the names of their groups, as far as the model tells."""
     source: Source
 
 
@@ -121,6 +123,7 @@ def measure(model: Model, selection: Selection, piece: Piece) -> Measured:
         targets=selection.targets,
         evaluated=evaluated,
         left_out=left_out,
+        trained_on=selection.seen_by(model.trained_on),
         source=selection.store.source,
     )
     return Measured(model=card, data=data, tally=tally)

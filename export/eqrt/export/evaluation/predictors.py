@@ -22,6 +22,7 @@ from eqrt.core.errors import EqrtError
 from eqrt.core.kalman import kalman
 from eqrt.core.kinematics import constant_turn, constant_velocity, fit_motion
 from eqrt.core.scene import Scene
+from eqrt.export.model_card import TRAINED_ON
 from eqrt.runtime.prediction.predictor import Predictor
 from eqrt.training.checkpoint import Checkpoint, load_checkpoint
 from eqrt.training.dataset.windows import Windows
@@ -70,6 +71,8 @@ class Model:
     card: ModelCard
     contract: ModelContract
     predict: Forecast
+    trained_on: frozenset[str] = frozenset()
+    """The groups that it was trained on (`group_digest`), as far as it tells."""
 
 
 def load_model(path: Path, threads: int = 1) -> Model:
@@ -107,7 +110,9 @@ def _load_artifact(folder: Path, threads: int) -> Model:
         license_=predictor.license,
         nc=predictor.non_commercial or forbids_commerce(predictor.license),
     )
-    return Model(card, contract, run)
+    trained_on = folder / TRAINED_ON
+    groups = trained_on.read_text(encoding="utf-8").split() if trained_on.is_file() else ()
+    return Model(card, contract, run, frozenset(groups))
 
 
 def _from_checkpoint(path: Path, checkpoint: Checkpoint) -> Model:
@@ -122,7 +127,7 @@ def _from_checkpoint(path: Path, checkpoint: Checkpoint) -> Model:
         license_=card.license,
         nc=card.non_commercial or forbids_commerce(card.license),
     )
-    return Model(told, contract, partial(predict, network))
+    return Model(told, contract, partial(predict, network), frozenset(card.trained_on))
 
 
 def baselines(dt_s: float, horizon_steps: int) -> Mapping[str, Forecast]:

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.metrics import horizons_s
 from eqrt.export.evaluation.measure import MODEL, PUBLISHED, REFUSED, DataCard, Measured, Settings
 from eqrt.export.evaluation.predictors import ModelCard
-from eqrt.export.evaluation.tally import GROUPS, Tally, horizons_s, mode_counts
+from eqrt.export.evaluation.tally import GROUPS, Tally, mode_counts
 from eqrt.training.dataset.store import license_notice
 from eqrt.training.recordings.recording import Source
 
@@ -78,7 +79,7 @@ def as_text(parts: Sequence[Measured], settings: Settings) -> str:
     model, tally = parts[0].model, total(parts)
     lines = _model_lines(model)
     for part in parts:
-        lines += _data_lines(part.data)
+        lines += _data_lines(part.data) + _warnings(part.data)
     lines.append(_settings_line(settings))
     lines += _license_lines(model, [part.data.source for part in parts])
     lines += ["", *_overall(model, tally), *_end(model, tally)]
@@ -116,6 +117,13 @@ def _data_lines(data: DataCard) -> list[str]:
         _head("", data.path),
         _head("targets", f"{data.evaluated:,} ({data.targets}), {left}"),
     ]
+
+
+def _warnings(data: DataCard) -> list[str]:
+    if not data.trained_on:
+        return []
+    many = f"{data.trained_on:,} of its {data.recordings:,} recordings"
+    return [_head("warning", f"the model was trained on the vehicles of {many}, by their names")]
 
 
 def _settings_line(settings: Settings) -> str:

@@ -6,7 +6,7 @@ one of the two has a gap is left out, and counted.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from eqrt.core.frames import Pose2
 from eqrt.export.formats import FORMATS
 from eqrt.training.dataset.pieces import RawData
 from eqrt.training.dataset.prepared import is_prepared
-from eqrt.training.dataset.split import SIDES
+from eqrt.training.dataset.split import SIDES, group_digest
 from eqrt.training.dataset.store import WindowStore, open_data
 from eqrt.training.dataset.windows import MIN_DRIVE_M, WindowOptions, Windows
 from eqrt.training.recordings.formats import ReaderOptions
@@ -53,6 +53,14 @@ class Selection:
     """Which they are: one of TARGETS."""
     recordings: int
     """How many the chosen split has."""
+
+    def seen_by(self, trained_on: Set[str]) -> int:
+        """How many of the recordings with candidates are of these groups (`group_digest`)."""
+        entries = [
+            self.store.recordings[i] for i in np.unique(self.store.column("recording")[self.rows])
+        ]
+        name = self.store.source.name
+        return sum(group_digest(name, entry.group) in trained_on for entry in entries)
 
     def batches(self, size: int) -> Iterator[Batch]:
         """The candidates, `size` at a time."""

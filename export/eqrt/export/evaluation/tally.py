@@ -15,6 +15,7 @@ from eqrt.core.metrics import (
     brier_min_fde,
     calibration,
     displacement,
+    horizons_s,
     min_ade,
     min_fde,
     missed,
@@ -32,15 +33,8 @@ GROUPS = (
     *(("manoeuvre", manoeuvre) for manoeuvre in MANOEUVRES),
 )
 """The rows of a report: by what, and which."""
-SECONDS = (1.0, 2.0, 3.0)
 COMMON_MODES = 6
 """The number of modes that the field compares at."""
-
-
-def horizons_s(dt_s: float, horizon_steps: int) -> tuple[float, ...]:
-    """The times that errors are given for: 1, 2, 3 s as far as they go, and the horizon's end."""
-    end = round(horizon_steps * dt_s, 6)
-    return (*(seconds for seconds in SECONDS if seconds < end), end)
 
 
 def mode_counts(num_modes: int) -> tuple[int, ...]:

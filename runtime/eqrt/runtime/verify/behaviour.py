@@ -23,7 +23,9 @@ from eqrt.runtime.verify.scenes import (
     moved,
     random_pose,
     rows_of,
+    speed_mps,
     stacked,
+    target_is_seen,
 )
 
 MIN_VECTORS = 20
@@ -34,6 +36,13 @@ SUM = 1e-4
 """Probabilities add up to 1 within this."""
 THREADS_M = 1e-4
 """Two threads may add in another order than one."""
+MOVING_MPS = 2.0
+"""Over the last second: from here on a target's motion is its heading (docs/frames.md)."""
+HEADINGS = {"heading not known": (0.0, 0.0)} | {
+    f"heading {degrees} degrees": (np.cos(np.radians(degrees)), np.sin(np.radians(degrees)))
+    for degrees in (30, 120, 210, 300)
+}
+"""What is said of a target that moves; as unit vectors."""
 FILLERS = (np.nan, np.inf, -np.inf, 1e30)
 """Put where a mask is False."""
 
@@ -175,6 +184,30 @@ def check_lines(trial: Trial) -> Check:
     return Check(check.name, Result.NOTED, figure, "any: lines are sorted, the nearest first")
 
 
+def check_heading(trial: Trial) -> Check:
+    """The measured heading is for targets that stand: of one that moves it changes nothing.
+
+    Whatever heading is said of a moving target, or none, its prediction stays.
+    """
+    contract = trial.predictor.contract
+    scenes = trial.scenes | {"plain": hostile_scenes(contract)["plain"]}
+    moving = {
+        name: scene
+        for name, scene in scenes.items()
+        if target_is_seen(scene) and speed_mps(scene, contract.dt_s) >= MOVING_MPS
+    }
+    before = predict(trial.predictor, stacked(moving))
+    found: list[Difference] = []
+    for said, heading in HEADINGS.items():
+        measured = np.array([heading], np.float32)
+        after = {name: replace(scene, heading=measured) for name, scene in moving.items()}
+        names = [f"{name}, {said}" for name in moving]
+        found += differences(names, predict(trial.predictor, stacked(after)), before)
+    check = _judged("heading", found)
+    figure = f"{len(moving)} targets at {MOVING_MPS:g} m/s or more, {check.figure}"
+    return replace(check, figure=figure)
+
+
 def check_padding(trial: Trial) -> Check:
     """Values under False masks change nothing, bit for bit."""
     names, scene = list(trial.scenes), stacked(trial.scenes)
@@ -236,6 +269,7 @@ CHECKS: dict[str, Callable[[Trial], Check]] = {
     "batch": check_batch,
     "order of neighbours": check_neighbours,
     "order of lines": check_lines,
+    "heading": check_heading,
     "padding": check_padding,
     "finite": check_finite,
     "determinism": check_determinism,

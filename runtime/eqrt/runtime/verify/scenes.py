@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
+from eqrt.core.kinematics import fit_motion
 from eqrt.core.scene import Scene, concatenate
 from eqrt.runtime.prediction.stored_vectors import StoredVector
 
@@ -177,6 +178,13 @@ def filled(scene: Scene, value: float) -> Scene:
 def target_is_seen(scene: Scene) -> bool:
     """Whether the target was seen now."""
     return bool(scene.history_valid[0, 0, -1])
+
+
+def speed_mps(scene: Scene, dt_s: float) -> float:
+    """How fast the target was over the last second."""
+    history, valid = scene.history[:, 0].astype(np.float64), scene.history_valid[:, 0]
+    velocity, _ = fit_motion(history, valid, dt_s)
+    return float(np.hypot(*velocity[0]))
 
 
 def place(scene: Scene) -> NDArray[np.float64]:

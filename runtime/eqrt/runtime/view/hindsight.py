@@ -7,7 +7,6 @@ constant velocity on the same predictions, here over the last minute.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -168,6 +167,6 @@ class _Tally:
         )
 
 
-def _horizons(forecast: ForecastSet) -> tuple[int, ...]:
+def _horizons(forecast: ForecastSet) -> tuple[float, ...]:
     reach_s = forecast.trajectories.shape[2] * forecast.dt_s
-    return tuple(s for s in LOOK_BACK_S if s <= reach_s + 1e-6) or (math.floor(reach_s) or 1,)
+    return tuple(s for s in LOOK_BACK_S if s <= reach_s + 1e-6) or (reach_s,)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -118,8 +119,11 @@ class Dataset(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def is_prepared(path: Path) -> bool:
-    """Whether `path` is a prepared folder, complete or not."""
-    return any((path / name).is_file() for name in (DATASET, _UNFINISHED))
+    """Whether `path` is a prepared folder, complete or not, even if its page is damaged.
+
+    Other programs call their pages `dataset.json`, too, and what is theirs is not replaced.
+    """
+    return any(_is_ours(path / name) for name in (DATASET, _UNFINISHED))
 
 
 def read_dataset(folder: Path) -> tuple[Settings, Totals]:
@@ -197,6 +201,15 @@ def discard_if_empty(folder: Path) -> None:
         if not any(folder.glob("shard-*")):
             discard(folder)
             folder.rmdir()
+
+
+def _is_ours(page: Path) -> bool:
+    """Whether it is a page as `_page` begins them, whatever version of eqrt wrote it."""
+    try:
+        with page.open("rb") as file:
+            return re.match(rb'\s*{\s*"schema": *\d+,\s*"settings":', file.read(100)) is not None
+    except OSError:
+        return False
 
 
 def _read(folder: Path) -> Dataset:

@@ -27,6 +27,9 @@ class Split:
     held_out: tuple[str, ...] = ()
     """Recordings or groups that are held out, and no others; empty = drawn. A recording takes its
     whole group with it."""
+    others_elsewhere: bool = False
+    """What of `held_out` is not here is in another dataset: a training configuration names what is
+    held out of all of them."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.held_out_share <= 1.0:
@@ -35,13 +38,13 @@ class Split:
     def sides(self, recordings: Sequence[tuple[str, str]]) -> list[str]:
         """TRAIN or VAL for each (name, group).
 
-        Raises EqrtError if something is held out that is not among them.
+        Raises EqrtError if something is held out that is not among them, unless it is elsewhere.
         """
         if not self.held_out:
             return [split_of(group, self.seed, self.held_out_share) for _, group in recordings]
         wanted = set(self.held_out)
         unknown = sorted(wanted.difference(*recordings))
-        if unknown:
+        if unknown and not self.others_elsewhere:
             raise EqrtError(f"held out is {unknown[0]!r}, which is no recording or group here")
         groups = {group for name, group in recordings if wanted & {name, group}}
         return [VAL if group in groups else TRAIN for _, group in recordings]
@@ -58,6 +61,14 @@ def in_share(group: str, share: float) -> bool:
     Whatever is in a smaller share is in every larger one; it has nothing to do with the sides.
     """
     return _drawn(f"share:{group}") < share
+
+
+def group_digest(source: str, group: str) -> str:
+    """How a model remembers a group of a source's that it was trained on: 12 hexadecimal digits.
+
+    Names of recordings may be private, and a model gets about.
+    """
+    return hashlib.sha256(f"{source}\n{group}".encode()).hexdigest()[:12]
 
 
 def _drawn(text: str) -> float:

@@ -6,6 +6,7 @@ memory. A store may join several datasets; rows are counted through all of them.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -40,6 +41,10 @@ MAX_OPEN_SHARDS = 512
 """Each takes a file descriptor, of which a process has 1024 unless told otherwise."""
 MAX_IN_MEMORY_BYTES = 4e9
 """Of windows cut on the fly; more is prepared first."""
+
+
+SAMPLED = 64
+"""Windows that are read to tell whether they are still the same."""
 
 
 class RecordingEntry(NamedTuple):
@@ -100,6 +105,15 @@ class WindowStore:
     def column(self, name: str) -> NDArray[Any]:
         """One of the columns that say where windows are from (`PROVENANCE`), for all rows."""
         return np.ascontiguousarray(self._provenance[name])
+
+    def checksum(self) -> int:
+        """Of where all windows are from, and of what SAMPLED of them, evenly spread, hold."""
+        named = "".join(f"{entry.name}\n{entry.group}\n" for entry in self.recordings)
+        checksum = zlib.crc32(named.encode())
+        for name in PROVENANCE:
+            checksum = zlib.crc32(self.column(name).tobytes(), checksum)
+        spread = np.linspace(0, len(self) - 1, min(SAMPLED, len(self))).astype(np.intp)
+        return self.gather(spread).checksum(checksum)
 
     def rows(self, split: str = "all") -> Rows:
         """The rows of one side, `train` or `val`, or `all`."""

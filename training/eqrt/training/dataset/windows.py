@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -74,6 +75,12 @@ class Windows:
         """The windows `rows`."""
         return Windows(**{name: getattr(self, name)[rows] for name in COLUMNS})
 
+    def checksum(self, before: int = 0) -> int:
+        """Of every bit, going on from that of what came before."""
+        for name in COLUMNS:
+            before = zlib.crc32(np.ascontiguousarray(getattr(self, name)).tobytes(), before)
+        return before
+
     def tensors(self) -> dict[str, Tensor]:
         """Inputs and futures as torch tensors, no copy."""
         return {name: torch.from_numpy(getattr(self, name)) for name in TENSORS}
@@ -111,7 +118,8 @@ class WindowOptions:
     """Which windows are cut."""
 
     stride: int | None = None
-    """Steps between windows; None = where the dataset says now, else a window every 5 steps."""
+    """Steps between windows, beside those where the dataset says now; None = there only, or where
+    it does not say it, every 5 steps."""
     targets: str = "all"
     """`focal`: the dataset's own targets. `complete`: every track that is seen at each step of its
     window and drives. `all`: every track seen now with a little past and future."""
@@ -145,10 +153,12 @@ class WindowCutter:
         return join(parts) if parts else no_windows(self._contract)
 
     def _steps(self, recording: Recording) -> Sequence[int]:
-        if self._options.stride is None and recording.now_steps is not None:
-            return recording.now_steps
+        """With a stride also the dataset's own: of a short scene, others are hardly complete."""
+        own = recording.now_steps or ()
+        if own and self._options.stride is None:
+            return own
         last = recording.tracks.num_steps - MIN_FUTURE_STEPS
-        return range(MIN_HISTORY_STEPS - 1, last, self._options.stride or 5)
+        return sorted({*range(MIN_HISTORY_STEPS - 1, last, self._options.stride or 5), *own})
 
     def _cut_at(
         self, recording: Recording, index: int, step: int, source: CenterlineSource | None

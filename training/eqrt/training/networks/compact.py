@@ -30,9 +30,10 @@ from eqrt.training.networks.config import UNIT_M, SceneConfig
 from eqrt.training.networks.layers import mlp
 from eqrt.training.networks.motion import SLOPE_STEPS
 from eqrt.training.networks.spread import SpreadDecoder, tile_covariances
-from eqrt.training.networks.target_frame import FRAMES, HEADINGS, check_choice
+from eqrt.training.networks.target_frame import FRAMES, HEADINGS
 from eqrt.training.networks.target_view import TOKENS, TargetView
 from eqrt.training.networks.time_basis import BASIS, time_basis
+from eqrt.training.tables import Count, PartialShare, check_choice, check_multiple
 
 _MASKED = 1e9  # a finite infinity: a row without any valid token must not become NaN
 
@@ -41,15 +42,15 @@ _MASKED = 1e9  # a finite infinity: a row without any valid token must not becom
 class CompactConfig:
     """Table [network] with kind = "compact"."""
 
-    width: int
-    """Of a token."""
-    hidden: int
+    width: Count
+    """Of a token; a multiple of `heads`."""
+    hidden: Count
     """Of the perceptrons."""
-    heads: int
+    heads: Count
     """Ways in which a mode looks at the tokens at once."""
-    layers: int
+    layers: Count
     """In each of which every mode looks at all tokens."""
-    dropout: float
+    dropout: PartialShare
     """Share of updates dropped while training."""
     heading: str = "robust"
     """Which way the target faces: one of HEADINGS (`eqrt.training.networks.target_frame`)."""
@@ -64,8 +65,7 @@ class CompactConfig:
         check_choice("heading", self.heading, HEADINGS)
         check_choice("frame", self.frame, FRAMES)
         check_choice("tokens", self.tokens, TOKENS)
-        if not isinstance(self.uncertainty, bool):
-            raise ValueError(f"uncertainty is {self.uncertainty!r}, expected true or false")
+        check_multiple("width", self.width, self.heads)
 
 
 class CompactPredictor(nn.Module):

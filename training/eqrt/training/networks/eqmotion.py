@@ -30,8 +30,9 @@ from eqrt.training.networks.eqmotion_layers import (
 from eqrt.training.networks.layers import GatedVectorMlp, mlp
 from eqrt.training.networks.map_tokens import AttentionEncoder, TransformerEncoder
 from eqrt.training.networks.modes import most_probable_first
-from eqrt.training.networks.raster import RasterEncoder
-from eqrt.training.networks.target_frame import MapPoints, TargetFrame
+from eqrt.training.networks.raster import Pixels, RasterEncoder
+from eqrt.training.networks.target_frame import FRAMES, HEADINGS, MapPoints, TargetFrame
+from eqrt.training.tables import Count, PartialShare, Positive, check_choice, check_multiple
 
 MAPS = ("none", "attention", "transformer", "raster")
 """The map encoders."""
@@ -41,13 +42,13 @@ MAPS = ("none", "attention", "transformer", "raster")
 class EqMotionConfig:
     """Table [network] with kind = "eqmotion"."""
 
-    hidden: int
+    hidden: Count
     """C = D: vectors per agent, and every width that is not named below."""
-    layers: int
+    layers: Count
     """P, feature-learning layers."""
-    mlp_layers: int
+    mlp_layers: Count
     """Layers of every perceptron."""
-    categories: int
+    categories: Count
     """R, interaction categories."""
     map: str
     """One of MAPS."""
@@ -55,26 +56,32 @@ class EqMotionConfig:
     """`translated` or `rotated` (`eqrt.training.networks.target_frame`)."""
     heading: str
     """`one_step` or `robust` (the same module)."""
-    heads: int
+    heads: Count
     """Of the transformer."""
-    token_width: int
+    token_width: Count
     """Of a map point in the attention or the transformer; there a multiple of `heads`."""
-    image_pixels: int
+    image_pixels: Pixels
     """Of one side of the drawn map (map = "raster"), a multiple of 4."""
-    image_cell_m: float
-    image_channels: int
+    image_cell_m: Positive
+    image_channels: Count
     """Of both convolutions."""
-    image_width: int
+    image_width: Count
     """First layer of the perceptron that reads the image."""
-    point_dropout: float = 0.0
+    point_dropout: PartialShare = 0.0
     """Share of the map's points that a training step does not read (attention, transformer)."""
+
+    def __post_init__(self) -> None:
+        check_choice("map", self.map, MAPS)
+        check_choice("frame", self.frame, FRAMES)
+        check_choice("heading", self.heading, HEADINGS)
+        if self.map == "transformer":
+            check_multiple("token_width", self.token_width, self.heads)
 
 
 class EqMotion(nn.Module):
     """EqMotion's backbone, and one of four readings of the map."""
 
     def __init__(self, scene: SceneConfig, config: EqMotionConfig) -> None:
-        """Raise ValueError for an unknown map, frame or heading."""
         super().__init__()
         width, depth = config.hidden, config.mlp_layers
         self.modes, self.steps = scene.num_modes, scene.horizon_steps
@@ -144,7 +151,7 @@ def read_map(
 
 
 def map_encoder(scene: SceneConfig, config: EqMotionConfig) -> nn.Module | None:
-    """The map encoder that the configuration names; ValueError if there is no such."""
+    """The map encoder that the configuration names; None for none."""
     hidden = [config.hidden] * config.mlp_layers
     tokens = scene.num_centerlines * scene.centerline_points
     if config.map == "none":
@@ -155,12 +162,10 @@ def map_encoder(scene: SceneConfig, config: EqMotionConfig) -> nn.Module | None:
         return TransformerEncoder(
             tokens, config.token_width, config.heads, hidden, config.point_dropout
         )
-    if config.map == "raster":
-        return RasterEncoder(
-            config.image_pixels,
-            config.image_cell_m,
-            scene.centerline_points,
-            config.image_channels,
-            [config.image_width, *hidden[1:]],
-        )
-    raise ValueError(f"map is {config.map!r}, expected one of {', '.join(MAPS)}")
+    return RasterEncoder(
+        config.image_pixels,
+        config.image_cell_m,
+        scene.centerline_points,
+        config.image_channels,
+        [config.image_width, *hidden[1:]],
+    )

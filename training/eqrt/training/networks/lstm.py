@@ -15,23 +15,24 @@ from eqrt.training.networks.canonical import last_valid, masked
 from eqrt.training.networks.config import UNIT_M, SceneConfig
 from eqrt.training.networks.layers import mlp
 from eqrt.training.networks.modes import most_probable_first
-from eqrt.training.networks.raster import RasterEncoder
+from eqrt.training.networks.raster import Pixels, RasterEncoder
+from eqrt.training.tables import Count, Positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LstmConfig:
     """Table [network] with kind = "lstm"."""
 
-    hidden: int
+    hidden: Count
     """Width of the LSTM, of the features and of the perceptrons."""
-    mlp_layers: int
+    mlp_layers: Count
     """Layers of every perceptron."""
-    image_pixels: int
+    image_pixels: Pixels
     """Of one side of the drawn map, a multiple of 4."""
-    image_cell_m: float
-    image_channels: int
+    image_cell_m: Positive
+    image_channels: Count
     """Of both convolutions."""
-    image_width: int
+    image_width: Count
     """First layer of the perceptron that reads the image."""
 
 

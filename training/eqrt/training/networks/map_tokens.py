@@ -47,10 +47,10 @@ class TransformerEncoder(nn.Module):
     def __init__(
         self, tokens: int, width: int, heads: int, sizes: list[int], dropout: float = 0.0
     ) -> None:
-        """`tokens`: Q * L. `sizes`: widths of the perceptron's layers. `dropout`: of points."""
+        """`tokens`: Q * L. `width`: a multiple of `heads`. `sizes`: widths of the perceptron's
+        layers. `dropout`: of points.
+        """
         super().__init__()
-        if width % heads:
-            raise ValueError(f"token width {width} is not a multiple of {heads} heads")
         self.dropout = dropout
         self.heads = heads
         self.embed = nn.Linear(2, width)

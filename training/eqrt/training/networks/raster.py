@@ -9,12 +9,15 @@ the grid is shifted by half a cell, so that the target's own axes are not such b
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+import msgspec
 import torch
 from torch import Tensor, nn
 
 from eqrt.training.networks.layers import mlp
 
+Pixels = Annotated[int, msgspec.Meta(ge=4, multiple_of=4)]
 LONGEST_M = 100.0
 """Lines up to this length are drawn without gaps."""
 

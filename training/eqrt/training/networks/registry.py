@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from torch import nn
@@ -13,6 +13,7 @@ from eqrt.training.networks.compact import CompactConfig, CompactPredictor
 from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.eqmotion import EqMotion, EqMotionConfig
 from eqrt.training.networks.lstm import LstmBaseline, LstmConfig
+from eqrt.training.tables import fill
 
 NETWORKS: Mapping[str, tuple[type[Any], type[nn.Module]]] = {
     "compact": (CompactConfig, CompactPredictor),
@@ -34,17 +35,19 @@ class ModelConfig:
     """That kind's configuration."""
 
     @classmethod
-    def from_tables(cls, scene: Mapping[str, Any], network: Mapping[str, Any]) -> ModelConfig:
-        """Raises ValueError that names the fields that are missing or unknown."""
-        kind = str(network.get("kind"))
-        if kind not in NETWORKS:
+    def from_tables(cls, scene: object, network: object) -> ModelConfig:
+        """Raises ValueError that names the table and what is missing, unknown or wrong in it."""
+        if not isinstance(network, Mapping):
+            raise ValueError(f"[network] is {network!r}, expected a table")
+        kind = network.get("kind")
+        if not isinstance(kind, str) or kind not in NETWORKS:
             kinds = ", ".join(NETWORKS)
             raise ValueError(f"[network] kind is {kind!r}, expected one of {kinds}")
         settings = {name: value for name, value in network.items() if name != "kind"}
         return cls(
-            scene=_fill(SceneConfig, scene, "scene"),
+            scene=fill(SceneConfig, scene, "scene"),
             kind=kind,
-            network=_fill(NETWORKS[kind][0], settings, "network"),
+            network=fill(NETWORKS[kind][0], settings, "network"),
         )
 
     def to_tables(self) -> dict[str, dict[str, Any]]:
@@ -63,12 +66,3 @@ class ModelConfig:
 def build_network(config: ModelConfig) -> nn.Module:
     """A new network with random weights (torch's global generator)."""
     return NETWORKS[config.kind][1](config.scene, config.network)
-
-
-def _fill(kind: type[Any], values: Mapping[str, Any], table: str) -> Any:
-    """`kind(**values)`; a field that has a default may be missing."""
-    names = {field.name for field in fields(kind)}
-    needed = {field.name for field in fields(kind) if field.default is MISSING}
-    if wrong := sorted((needed - set(values)) | (set(values) - names)):
-        raise ValueError(f"[{table}] has missing or unknown fields: {', '.join(wrong)}")
-    return kind(**values)

@@ -23,6 +23,7 @@ from eqrt.training.networks.canonical import (
     unit,
 )
 from eqrt.training.networks.config import UNIT_M
+from eqrt.training.tables import check_choice
 
 FRAMES = ("translated", "rotated")
 """What is done to positions: `translated` to the target only, or also `rotated` to its heading."""
@@ -87,12 +88,6 @@ class TargetFrame(nn.Module):
             moved = fitted_velocity(history, valid, self.dt_s)  # metres in one second
             return heading_vector(moved, heading, lane)
         return one_step_heading(history, valid, heading, lane)
-
-
-def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise ValueError if a setting is not one of its choices."""
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
 def upright(origin: Tensor) -> Tensor:

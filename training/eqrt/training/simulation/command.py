@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from eqrt.core.errors import EqrtError, LogError, UsageError
+from eqrt.training.recordings.formats import forbids_commerce
 from eqrt.training.recordings.recording import Source
 from eqrt.training.simulation.drivers import STEP_S
 from eqrt.training.simulation.run import OBSERVERS, Run, Tally, simulate
@@ -198,7 +199,7 @@ def _source(args: argparse.Namespace, scenarios: Sequence[Scenario]) -> Source:
         name=f"SUMO {names}",
         credits=f"{credit} {args.credit}".strip(),
         license=args.license,
-        non_commercial=False,
+        non_commercial=forbids_commerce(args.license),
     )
 
 
