@@ -298,6 +298,22 @@ def test_poses_that_end_before_the_dead_reckoning_begins_are_where_it_begins() -
     assert 110.0 < state.map_from_ego.x_m < 130.0
 
 
+@pytest.mark.parametrize("half", [{"speed_mps": 3.0}, {"yaw_rate_rad_s": 0.1}])
+def test_a_stationary_sensor_stands_until_all_of_its_motion_is_told(half: dict[str, float]) -> None:
+    """Half of it says nothing: it does not make a sensor that stands one without ego motion."""
+    tracker = EgoTracker(stationary=True)
+    for tick in range(50):
+        tracker.motion(EgoMotion(timestamp_s=tick / 10, **half))
+    state = tracker.at(4.9)
+    assert state is not None
+    assert_pose(state.map_from_ego, 0.0, 0.0, 0.0)
+    assert state.velocity[0] == 0.0
+    drive_steadily(tracker, speed_mps=10.0, yaw_rate_rad_s=0.0, from_s=5.0, to_s=6.0)
+    state = tracker.at(6.0)
+    assert state is not None
+    assert state.velocity[0] == pytest.approx(10.0)
+
+
 def test_a_stationary_sensor_keeps_the_pose_it_was_given() -> None:
     tracker = EgoTracker(stationary=True)
     give_pose(tracker, 0.0, 7.0, 8.0, 0.5)

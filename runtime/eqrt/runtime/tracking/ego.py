@@ -175,12 +175,16 @@ class EgoTracker:
         )
 
     def _dead_reckoning(self, timestamp_s: float) -> OdometryState | None:
-        if self._stationary and not self.counters.motions:
+        if self._stands():
             return _STANDING
         return self._odometry.at(timestamp_s)
 
+    def _stands(self) -> bool:
+        """As was said, until its speed and its yaw rate both are known."""
+        return self._stationary and not self._odometry.has_begun
+
     def _is_anchored(self, timestamp_s: float) -> bool:
-        if self._stationary and not self.counters.motions:
+        if self._stands():
             return self._poses.newest_s is not None
         return abs(timestamp_s - self._anchored_s) <= self._max_pose_age_s
 

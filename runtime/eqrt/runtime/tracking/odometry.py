@@ -73,6 +73,11 @@ class Odometry:
         """One measured yaw rate, bias included; False as in `add_speed`."""
         return self._add(self._yaw_rate, timestamp_s, yaw_rate_rad_s)
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether speed and yaw rate are known, so that there is something to integrate."""
+        return bool(self._times)
+
     def at(self, timestamp_s: float) -> OdometryState | None:
         """State at a time up to 0.2 s past the newest; None beyond, or before the oldest kept."""
         if not self._times:
