@@ -9,11 +9,12 @@ import pytest
 
 from drives import DRIVES, TILE, first_seconds
 from eqrt.cli import main
-from eqrt.runtime.advice import unused_map
+from eqrt.runtime.advice import taken_to_stand, unused_map
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.prediction.tiles import load_tile
 from processes import Serving
+from tiny_sensor import COUNTED, profile_of
 from two_tiles import other_tile
 
 WITHOUT_POSES = "the map will not be used, because the profile 'ars408' gives no poses"
@@ -43,6 +44,27 @@ def test_the_service_says_that_a_map_without_poses_is_not_used() -> None:
         status, _, errors = service.end()
     assert status == 0
     assert WITHOUT_POSES in errors
+
+
+def test_a_profile_that_tells_no_motion_is_said_to_stand(tmp_path: Path) -> None:
+    """Unless the user says so."""
+    radar = profile_of(tmp_path, COUNTED)
+    assert "taken to stand still" in (taken_to_stand(radar, stationary=False) or "")
+    assert taken_to_stand(radar, stationary=True) is None
+    for name in ("ars408", "srr520", "sbg-ins"):
+        assert taken_to_stand(load_profile(name), stationary=False) is None
+
+
+def test_the_service_says_that_the_sensor_is_taken_to_stand(tmp_path: Path) -> None:
+    profile_of(tmp_path, COUNTED)
+    channel = f"advice-{time.monotonic_ns()}"
+    on = ["--can", channel, "--can-interface", LOCAL, "--profile", str(tmp_path / "tiny.toml")]
+    with Serving(*on) as service:
+        _, _, errors = service.end()
+    with Serving(*on, "--stationary") as service:
+        _, _, silence = service.end()
+    assert "eqrt: the profile 'tiny' has no [[ego]]" in errors
+    assert "[[ego]]" not in silence
 
 
 def test_a_map_is_used_where_there_are_poses_for_it(tmp_path: Path) -> None:

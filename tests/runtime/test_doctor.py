@@ -107,7 +107,7 @@ def test_what_a_profile_gives_is_told() -> None:
     known = {
         "ars408": "ars408: 1 sensor, speed, yaw rate, no pose; 6 CAN ids",
         "sbg-ins": "sbg-ins: no sensors, speed, yaw rate, pose; 5 CAN ids",
-        "srr520": "srr520: 1 sensor, no speed, no yaw rate, no pose; ",
+        "srr520": "srr520: 1 sensor, speed, yaw rate, no pose; 2 CAN ids",
     }
     for name, found in known.items():
         assert check_profile(name)[1].found.startswith(found)

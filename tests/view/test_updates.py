@@ -91,7 +91,7 @@ def test_what_only_seems_to_stand_is_not_said_to_be_predicted() -> None:
     assert agents["words"] == ["not predicted: nothing tells how it moves"]
     assert agents["speed_mps"] == [None]
     agents = decode_update(update_of(unknown))[0]["agents"]
-    assert agents["words"] == ["by the model, from a short history"]
+    assert agents["words"] == ["from a short history"]
 
 
 def test_an_ellipse_holds_half_of_the_distribution() -> None:

@@ -30,6 +30,17 @@ def unused_map(profile: Profile, tile: Tile | None) -> str | None:
     return None
 
 
+def taken_to_stand(profile: Profile, *, stationary: bool) -> str | None:
+    """That nothing will tell how the car moves; None if something may, or it is said to stand."""
+    if profile.has_ego or stationary or not profile.sensors:
+        return None
+    return (
+        f"the profile {profile.name!r} has no [[ego]], so the sensor is taken to stand still, and "
+        "in a car that moves all predictions are wrong; add one (docs/start-radar.md), or say "
+        "--stationary"
+    )
+
+
 def without_motion(missing: Iterable[str]) -> str:
     """What to do where nothing tells how the car moves. `missing`: names of the profile's sources
     that tell nothing; those about the car are named.

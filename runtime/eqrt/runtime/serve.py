@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
-from eqrt.runtime.advice import unused_map
+from eqrt.runtime.advice import taken_to_stand, unused_map
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.health import in_sum, trouble
 from eqrt.runtime.bus.ids import Ids
@@ -57,7 +57,8 @@ def load_pipeline(
     if predictor.license_notice:
         Outlet(sys.stderr).put(f"eqrt: {predictor.license_notice}")
     tile = load_tile(args.tile) if args.tile else None
-    if warning := unused_map(profile, tile):
+    standing = taken_to_stand(profile, stationary=args.stationary)
+    for warning in filter(None, (unused_map(profile, tile), standing)):
         Outlet(sys.stderr).put(f"eqrt: {warning}")
     return Pipeline(
         profile,

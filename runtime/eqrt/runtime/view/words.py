@@ -31,7 +31,7 @@ MODE_WORDS = {
 }
 AGENT_WORDS = {
     Mode.RUN: "by the model, from a full history",
-    Mode.PARTIAL: "by the model, from a short history",
+    Mode.PARTIAL: "from a short history",
     Mode.LATE: "at constant turn rate and speed: no time for the model",
     Mode.FALLBACK: "at constant turn rate and speed: the model failed",
 }
