@@ -79,18 +79,24 @@ class Serving:
 
     def wait_until_ready(self) -> Self:
         """Wait until it listens; it says so."""
-        assert self._process.stdout is not None
-        self.ready = self._process.stdout.readline()
+        self.ready = self._line()
         assert self.ready.startswith("eqrt serve: "), self.end()
         return self
 
     def read_until(self, pattern: str) -> str:
         """Read its output up to a line in which the pattern is: what its first group is there."""
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+        while line := self._line():
             if found := re.search(pattern, line):
                 return found[1]
         raise AssertionError(self.end())
+
+    def _line(self) -> str:
+        """The next line, and nothing beyond it: what a stream takes along, `end` would not get."""
+        assert self._process.stdout is not None
+        line = b""
+        while not line.endswith(b"\n") and (byte := os.read(self._process.stdout.fileno(), 1)):
+            line += byte
+        return line.decode()
 
     def stop_reading(self) -> None:
         """Close our end of its standard output."""

@@ -62,10 +62,11 @@ def no_predictions(pipeline: Pipeline) -> str:
     """Why nothing came out of all that a pipeline was fed."""
     decoded, profile = pipeline.decoder.counters, pipeline.profile
     if not decoded.used:
-        return (
+        of_others = (
             f"none of the {decoded.messages} messages is one that the profile {profile.name!r} "
             "reads; another --profile or --can? `eqrt can check` says what is there"
         )
+        return of_others if decoded.messages else "there are no messages in it"
     if not profile.sensors:
         return f"the profile {profile.name!r} has no [[sensor]], so there is nothing to predict"
     if not decoded.cycles:
