@@ -31,6 +31,7 @@ NOT_RUN = (
     ),
     NotRun(r"", r"python3 -m venv .venv ", "makes an environment; tests/packaging installs eqrt"),
     NotRun(r"deploy/README", r"sudo ", "changes the machine; vcan.sh is tried in tests/socketcan"),
+    NotRun(r"output", r"sudo ", "changes the machine"),
     NotRun(r"reliability", r"echo .* \| sudo tee ", "changes the machine"),
     NotRun(r"deploy/README", r"journalctl ", "needs a running systemd"),
     NotRun(r"deploy/README", r"docker ", "needs docker and a network"),

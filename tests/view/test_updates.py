@@ -86,11 +86,12 @@ def test_a_heading_is_measured_or_where_it_drives_to_or_not_known() -> None:
 
 def test_what_only_seems_to_stand_is_not_said_to_be_predicted() -> None:
     unknown = replace(one_car(), velocity=np.full((1, 2), np.nan))
-    late = replace(unknown, agent_mode=np.array([Mode.LATE], np.uint8))
-    agents = decode_update(update_of(late))[0]["agents"]
-    assert agents["words"] == ["not predicted: nothing tells how it moves"]
-    assert agents["speed_mps"] == [None]
-    agents = decode_update(update_of(unknown))[0]["agents"]
+    for mode in (Mode.PARTIAL, Mode.LATE, Mode.FALLBACK):
+        found = replace(unknown, agent_mode=np.array([mode], np.uint8))
+        agents = decode_update(update_of(found))[0]["agents"]
+        assert agents["words"] == ["not predicted: nothing tells how it moves"]
+        assert agents["speed_mps"] == [None]
+    agents = decode_update(update_of(one_car()))[0]["agents"]
     assert agents["words"] == ["from a short history"]
 
 
