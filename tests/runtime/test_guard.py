@@ -208,6 +208,23 @@ def test_what_was_measured_does_not_replace_what_the_history_tells() -> None:
     np.testing.assert_array_equal(found.trajectories, raw.trajectories)
 
 
+def test_histories_of_less_than_a_second_are_counted_whole() -> None:
+    """A model may read eight steps; all of them seen are enough."""
+    raw = driving()
+    targets = raw.targets
+    measured = np.array([[-25.0, 3.0]])
+    found = guard(
+        raw.trajectories,
+        raw.probabilities,
+        targets.history[:, -8:],
+        targets.valid[:, -8:],
+        DT_S,
+        measured=measured,
+    )
+    np.testing.assert_allclose(found.velocity, [[12.0, 0.0]])
+    np.testing.assert_array_equal(found.trajectories, raw.trajectories)
+
+
 def test_a_model_that_fails_is_said_to_have_failed_of_what_was_just_found_too() -> None:
     raw = seen_once((-25.0, 0.0))
     raw.trajectories[:] = np.nan
