@@ -339,6 +339,7 @@ def test_no_targets_are_targets_with_every_field_empty() -> None:
     assert len(Raw.silent(nobody, CONTRACT).trajectories) == 0
     assert nobody.history.shape == (0, CONTRACT.history_steps, 2)
     assert nobody.valid.shape == (0, CONTRACT.history_steps)
+    assert nobody.velocity.shape == (0, 2)
     for field in fields(Targets):
         empty, full = getattr(nobody, field.name), getattr(some, field.name)
         assert (len(empty), empty.dtype) == (0, full.dtype), field.name
