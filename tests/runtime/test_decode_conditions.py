@@ -315,6 +315,24 @@ def test_a_number_between_two_values_is_equal_to_neither(
     assert holds(f"X >= {number}", signal, payloads) == [False, True]
 
 
+@pytest.mark.parametrize(
+    ("number", "scale", "offset", "raw", "is_equal"),
+    [
+        ("1e3", 1024.0, 0.0, 1, True),  # rounded to thousands
+        ("0x3e8", 1024.0, 0.0, 1, False),  # to the last digit
+        ("0x63", 100.0, 0.0, 1, False),
+        ("0e1", 10.0, -1.0, 0, True),  # just a tenth of a bit away
+        ("0.10000000000000000", 0.1, 0.3, -2, True),  # but for what floating point adds
+    ],
+)
+def test_as_many_digits_count_as_are_written(
+    number: str, scale: float, offset: float, raw: int, is_equal: bool
+) -> None:
+    condition = parse_condition(f"x == {number}", lambda found: found.of_raw(scale, offset))
+    assert condition.operands == (Operand("x", True),)
+    assert condition.evaluate([float(raw)]) is is_equal
+
+
 @pytest.mark.parametrize("number", ["1e308", "-1e308", "1e-320", "0e99999", "1e-99999"])
 @pytest.mark.parametrize("scale", [1e-300, -1e-300, 1e300])
 def test_numbers_that_are_far_away_are_compared_as_well(scale: float, number: str) -> None:
