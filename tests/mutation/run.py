@@ -64,6 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("modules", nargs="*", help=f"of {', '.join(known)} (default: all)")
     parser.add_argument("--jobs", type=int, default=1, help="mutants at a time (default: 1)")
     args = parser.parse_args(argv)
+    if strange := ", ".join(sorted(set(args.modules) - set(known))):
+        parser.error(f"not in tests/mutation/modules.toml: {strange}; it has {', '.join(known)}")
     unexplained = 0
     print("| module | mutants | noticed | explained | unexplained | seconds |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |", flush=True)
