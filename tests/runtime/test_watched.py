@@ -288,6 +288,30 @@ def test_a_model_that_cannot_be_loaded_is_tried_again_after_pauses_that_grow(
     assert model.restarts == 0
 
 
+def test_a_model_that_takes_long_to_load_is_waited_for(hang: Hang, clock: Clock) -> None:
+    """However many cycles come meanwhile; it is not given up for another attempt."""
+    loading = Hang()
+
+    class SlowToLoad(Scripted):
+        def again(self) -> Scripted:
+            successor = super().again()
+            loading(0)
+            return successor
+
+    family = SlowToLoad(hang, well)
+    model = Watched(family, clock)
+    with pytest.raises(TooLate):
+        model.run(scene(), 0.01)
+    for _ in range(3):
+        clock.now_s += 10.0 * STUCK_S
+        with pytest.raises(Failed):
+            model.run(scene(), PATIENCE_S)
+    loading.over.set()
+    loaded()
+    assert len(model.run(scene(2), PATIENCE_S).trajectories) == 2
+    assert (family.loads, model.restarts) == (1, 1)
+
+
 def test_another_model_in_the_same_folder_is_not_taken_for_this_one(clock: Clock) -> None:
     """Files that were replaced wait for a reload, which looks at the contract."""
 

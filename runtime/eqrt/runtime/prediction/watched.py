@@ -223,7 +223,7 @@ class _Successor:
 
     def __init__(self, model: Model) -> None:
         self.model: Model | None = None
-        self._is_loading = True
+        self._is_over = threading.Event()
         threading.Thread(target=self._load, args=[model], name="model loader", daemon=True).start()
 
     def _load(self, model: Model) -> None:
@@ -234,7 +234,7 @@ class _Successor:
                 if loaded.model_id == model.model_id:  # another one is for `Pipeline.exchange`
                     self.model = loaded
         finally:
-            self._is_loading = False
+            self._is_over.set()
 
     def is_loading(self) -> bool:
-        return self._is_loading
+        return not self._is_over.is_set()
