@@ -64,6 +64,17 @@ def test_a_model_of_longer_histories_gets_them_as_they_come() -> None:
     assert modes == [{Mode.PARTIAL}] * 49 + [{Mode.RUN}] * 2
 
 
+@pytest.mark.parametrize(("steps", "dt_s"), [(50, 0.1), (25, 0.2)])
+def test_the_first_model_gets_histories_as_long_as_it_reads(steps: int, dt_s: float) -> None:
+    """Five seconds at 24 Hz, the rate of which most measurements are kept."""
+    model = Steady(replace(STEADY, history_steps=steps, dt_s=dt_s))
+    pipeline = Pipeline(load_profile("generic"), model)
+    forecasts = said(pipeline, (m for step in range(121) for m in cycle(CARS, step / 24)))
+    modes = [set(forecast.agent_mode.tolist()) for forecast in forecasts]
+    assert modes[0] == {Mode.PARTIAL}
+    assert modes[-1] == {Mode.RUN}
+
+
 def test_lanes_are_those_of_the_new_tile(tmp_path: Path) -> None:
     """Without lanes near the cars, the model predicts what it predicts without a map."""
     tile = load_tile(TILE)
