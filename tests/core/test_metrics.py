@@ -13,6 +13,7 @@ from eqrt.core.metrics import (
     error_table,
     final_displacement,
     inside,
+    least_ade,
     log_density,
     mahalanobis,
     min_ade,
@@ -83,6 +84,7 @@ def test_the_best_mode_is_the_one_that_ends_nearest() -> None:
 def test_min_ade_is_that_of_the_best_mode_and_not_the_least_of_all() -> None:
     """Target 0: mode 1 has the least ADE, (1 + 1 + 4) / 3 = 2, but ends 4 m away."""
     np.testing.assert_allclose(min_ade(TWO_TARGETS), [(4.0 + 6.0 + 2.0) / 3, 3.0])
+    np.testing.assert_allclose(least_ade(TWO_TARGETS), [2.0, 2.0])
 
 
 def test_of_two_modes_that_end_equally_near_the_more_probable_counts() -> None:

@@ -118,10 +118,12 @@ def test_errors_of_eight_modes_by_hand() -> None:
         "miss_rate": 1.0,
         "min_ade_6": 3.0,
         "min_fde_6": 3.0,
+        "least_ade_6": 3.0,
         "miss_rate_6": 1.0,
         "brier_min_fde_6": 3.0 + (1 - 1 / 6) ** 2,
         "min_ade_8": 1.0,
         "min_fde_8": 1.0,
+        "least_ade_8": 1.0,
         "miss_rate_8": 0.0,
         "brier_min_fde_8": 1.0 + (1 - 1 / 8) ** 2,
     }

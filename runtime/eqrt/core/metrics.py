@@ -88,6 +88,14 @@ def min_ade(distance: Float64) -> Float64:
     return np.asarray(np.take_along_axis(distance, best, axis=-2)[..., 0, :].mean(axis=-1))
 
 
+def least_ade(distance: Float64) -> Float64:
+    """(B,) metres: the least ADE of any mode, of distances (B, K, H); never above `min_ade`.
+
+    nuScenes calls this minADE (its prediction challenge); it may be another mode's than `min_fde`.
+    """
+    return np.asarray(distance.mean(axis=-1).min(axis=-1))
+
+
 def missed(distance: Float64) -> NDArray[np.bool_]:
     """(B,) whether every mode of distances (B, K, H) ends more than MISS_M from the truth."""
     return np.asarray(min_fde(distance) > MISS_M)

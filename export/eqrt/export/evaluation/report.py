@@ -179,13 +179,16 @@ def _end(model: ModelCard, tally: Tally) -> list[str]:
 def _best_of(model: ModelCard, tally: Tally) -> list[str]:
     """The best of several modes, where there are several."""
     table = tally.means(0)[MODEL]
-    return [
-        f"{f'best of {modes} modes':<{_NAME}}{int(tally.counts[0]):>9,}"
-        f"   minADE {table[f'min_ade_{modes}']:.3f}   minFDE {table[f'min_fde_{modes}']:.3f}"
-        f"   missed {table[f'miss_rate_{modes}']:.1%}"
-        f"   brier-minFDE {table[f'brier_min_fde_{modes}']:.3f}"
-        for modes in mode_counts(model.modes)
-    ]
+    lines = []
+    for modes in mode_counts(model.modes):
+        lines += [
+            f"{f'best of {modes} modes':<{_NAME}}{int(tally.counts[0]):>9,}"
+            f"   minADE {table[f'min_ade_{modes}']:.3f}   minFDE {table[f'min_fde_{modes}']:.3f}"
+            f"   missed {table[f'miss_rate_{modes}']:.1%}"
+            f"   brier-minFDE {table[f'brier_min_fde_{modes}']:.3f}",
+            f"{'  of any of them':<{_NAME + 9}}   least ADE {table[f'least_ade_{modes}']:.3f}",
+        ]
+    return lines
 
 
 def _calibration(model: ModelCard, tally: Tally) -> list[str]:

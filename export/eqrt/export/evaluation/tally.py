@@ -16,6 +16,7 @@ from eqrt.core.metrics import (
     calibration,
     displacement,
     horizons_s,
+    least_ade,
     min_ade,
     min_fde,
     missed,
@@ -63,6 +64,7 @@ def errors_of(predicted: Predicted, truth: Float64, dt_s: float) -> dict[str, Fl
         likeliest = distance[:, :modes]
         errors[f"min_ade_{modes}"] = min_ade(likeliest)
         errors[f"min_fde_{modes}"] = min_fde(likeliest)
+        errors[f"least_ade_{modes}"] = least_ade(likeliest)
         errors[f"miss_rate_{modes}"] = missed(likeliest).astype(np.float64)
         errors[f"brier_min_fde_{modes}"] = brier_min_fde(likeliest, probabilities[:, :modes])
     if predicted.end_covariances is not None:
