@@ -180,6 +180,39 @@ def test_speed_limits_are_the_maps_own(write: Write) -> None:
     assert lane_map.lane_type.tolist() == [LaneType.HIGHWAY, LaneType.URBAN]
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ('<relation id="22"', '<relation id="21"', "relation 21 comes again"),
+        ('<way id="14"', '<way id="12"', "way 12 comes again"),
+        ('<relation id="22"', "<relation", "relation '': its id is not a whole number"),
+        ('"13"', '"left side"', "way 'left side': its id is not a whole number"),
+        ('id="22"', 'id="9223372036854775808"', "'9223372036854775808': its id is not"),
+        ('"way" ref="13"', '"node" ref="1"', "lanelet 22 has a left bound that is not there"),
+        ('<way id="14"', '<way action="delete" id="14"', "not whole (way 14)"),
+        ('<node id="6"', '<node action="delete" id="6"', "not whole (way 14)"),
+    ],
+)
+def test_what_would_crash_the_library_is_left_out_and_named(
+    write: Write, before: str, after: str, said: str
+) -> None:
+    """In a process of its own, that a crash does not end the tests."""
+    source = write(osm(LOCAL, *ROAD).replace(before, after))
+    out = source.with_suffix(".tile")
+    command = [sys.executable, "-m", "eqrt", "tile", "build", str(source), "--out", str(out)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert said in done.stderr
+    assert load_tile(out).lane_map.lane_id.tolist() == [21]
+
+
+def test_a_deleted_lanelet_is_no_lane_and_no_loss(write: Write) -> None:
+    gone = ROAD[1].replace("<relation", "<relation action='delete'")
+    lane_map, _, skipped = build(write(osm(LOCAL, ROAD[0], gone)))
+    assert lane_map.lane_id.tolist() == [21]
+    assert skipped == []
+
+
 def test_broken_lanelets_are_left_out_and_named(write: Write) -> None:
     dangling = lanelet(23, 11, 99)
     shapeless = '<relation id="24"><tag k="type" v="lanelet"/></relation>'
@@ -208,6 +241,8 @@ def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
         ("<commonRoad/>", "the root is <commonRoad>, expected <osm> with nodes"),
         ("<osm version='0.6'/>", "expected <osm> with nodes"),
         (osm('<node id="1" lat="" lon=""/>'), "a node's place is ('', ''), expected two numbers"),
+        ('<?xml version="1.0" encoding="klingon"?><osm/>', "not XML (unknown encoding: klingon)"),
+        ('<?xml version="1.0" encoding="shift_jis"?><osm/>', "not XML (multi-byte encodings"),
         (osm(LOCAL), "no lanes for vehicles"),
         (osm(LOCAL, lanelet(21, 11, 12, subtype="walkway")), "no lanes for vehicles"),
         (osm(local_node(1, 4e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
