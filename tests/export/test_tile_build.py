@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gzip
+import math
 import subprocess
 import sys
 from collections.abc import Callable
@@ -56,6 +57,16 @@ def lanelet(lanelet_id: int, left: int, right: int, **tags: str) -> str:
 
 def tagged(tags: dict[str, str]) -> str:
     return "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+
+
+def global_nodes(latitude_deg: float, longitude_deg: float, **tags: str) -> str:
+    """The nodes of `PLACES` with (0, 0) there: a degree of latitude is about 111 km."""
+    nodes = []
+    for node, (x_m, y_m) in PLACES.items():
+        lat = latitude_deg + y_m / 111e3
+        lon = longitude_deg + x_m / (111e3 * math.cos(math.radians(latitude_deg)))
+        nodes.append(f'<node id="{node}" lat="{lat}" lon="{lon}">{tagged(tags)}</node>')
+    return "".join(nodes)
 
 
 def local_node(node: int, x_m: float, y_m: float) -> str:
@@ -150,6 +161,32 @@ def test_without_an_origin_the_middle_of_the_map_is_zero() -> None:
     assert 8.41 < info.origin_longitude_deg < 8.46
 
 
+@pytest.mark.parametrize("west_deg", [179.9999, -180.0001])
+def test_a_map_across_the_antimeridian_has_its_origin_there(write: Write, west_deg: float) -> None:
+    """20 m west of it to 20 m east of it, where a degree of longitude is 106.5 km."""
+    nodes = ""
+    for node, (x, y) in PLACES.items():
+        longitude_deg = math.remainder(west_deg + x / 106.5e3, 360.0)
+        nodes += f'<node id="{node}" lat="{-17.0 + y / 110.7e3}" lon="{longitude_deg}"/>'
+    lane_map, info, _ = build(write(osm(nodes, *ROAD)))
+    assert abs(info.origin_longitude_deg) == pytest.approx(179.9999122, abs=2e-7)
+    np.testing.assert_allclose(lane_map.points[[0, -1]], [[-20, 0], [20, 0]], atol=0.02)
+
+
+def test_longitudes_beyond_180_degrees_are_those_of_the_other_side(write: Write) -> None:
+    west, _, _ = build(write(osm(global_nodes(-17.0, -170.0), *ROAD)))
+    east, info, _ = build(write(osm(global_nodes(-17.0, 190.0), *ROAD)))
+    assert info.origin_longitude_deg == pytest.approx(-169.9998, abs=1e-4)
+    np.testing.assert_allclose(east.points, west.points, atol=0.01)
+
+
+def test_heights_do_not_move_the_map(write: Write) -> None:
+    """5 km from the origin, 2,240 m (Mexico City) would move it outwards by 1.76 m."""
+    flat, _, _ = build(write(osm(global_nodes(19.4, -99.1), *ROAD)), (19.4, -99.15))
+    high = osm(global_nodes(19.4, -99.1, ele="2240"), *ROAD)
+    np.testing.assert_array_equal(build(write(high), (19.4, -99.15))[0].points, flat.points)
+
+
 def test_a_map_around_latitude_and_longitude_zero_keeps_its_plane() -> None:
     """Town10HD spans 225 by 210 m around CARLA's own origin."""
     lane_map, info, _ = town10hd()
@@ -178,6 +215,34 @@ def test_speed_limits_are_the_maps_own(write: Write) -> None:
     lane_map, _, _ = build(write(osm(LOCAL, stated, lanelet(22, 13, 14))))
     np.testing.assert_allclose(lane_map.speed_limit_mps, [10.0, np.nan])
     assert lane_map.lane_type.tolist() == [LaneType.HIGHWAY, LaneType.URBAN]
+
+
+SIGN = (
+    '<relation id="31"><tag k="type" v="regulatory_element"/>'
+    '<tag k="subtype" v="speed_limit"/><tag k="sign_type" v="{}"/></relation>'
+)
+SIGNED = ROAD[0].replace(
+    "</relation>", '<member type="relation" ref="31" role="regulatory_element"/></relation>'
+)
+
+
+@pytest.mark.parametrize("said", ["none", "walk", "-30", "0", "5000", "nan"])
+def test_a_speed_limit_that_is_none_is_not_known(write: Write, said: str) -> None:
+    odd = lanelet(21, 11, 12, speed_limit=said)
+    lane_map, _, skipped = build(write(osm(LOCAL, odd, lanelet(22, 13, 14, speed_limit="36"))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [np.nan, 10.0])
+    assert lane_map.successors_of(0).tolist() == [1]
+    assert skipped == [f"speed limit of lanelet 21: {said} is not a known speed"]
+
+
+def test_a_sign_that_is_not_known_costs_its_speed_limit_only(write: Write) -> None:
+    lane_map, _, skipped = build(write(osm(LOCAL, SIGNED, ROAD[1], SIGN.format("36 km/h"))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [10.0, np.nan])
+    assert skipped == []
+    lane_map, _, skipped = build(write(osm(LOCAL, SIGNED, ROAD[1], SIGN.format("R2-1"))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [np.nan, np.nan])
+    assert lane_map.successors_of(0).tolist() == [1]
+    assert skipped == ["speed limit of lanelet 21: what its sign says is not a known speed"]
 
 
 @pytest.mark.parametrize(
@@ -243,6 +308,9 @@ def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
         (osm('<node id="1" lat="" lon=""/>'), "a node's place is ('', ''), expected two numbers"),
         ('<?xml version="1.0" encoding="klingon"?><osm/>', "not XML (unknown encoding: klingon)"),
         ('<?xml version="1.0" encoding="shift_jis"?><osm/>', "not XML (multi-byte encodings"),
+        (osm(LOCAL.replace("</node>", "<a>" * 9999 + "</a>" * 9999 + "</node>")), "recursion"),
+        (osm(global_nodes(139.7, 35.7), *ROAD), "are latitude and longitude swapped?"),
+        (osm(LOCAL.replace('v="20"', 'v="nan"'), *ROAD), "a node's place is ('nan', '4')"),
         (osm(LOCAL), "no lanes for vehicles"),
         (osm(LOCAL, lanelet(21, 11, 12, subtype="walkway")), "no lanes for vehicles"),
         (osm(local_node(1, 4e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),

@@ -77,18 +77,24 @@ def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
     lanelet2 = _import_lanelet2()
     root = read_osm(source)
     skipped = keep_lanelets(root)
+    _lay_flat(root)
     planar = _move_to_plane(root, source, lanelet2) or _near_null_island(_middle(root, source))
     projected_from = (0.0, 0.0) if planar else origin or _middle(root, source)
     projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*projected_from))
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder, "map.osm")
-        ElementTree.ElementTree(root).write(plain)
         try:
+            ElementTree.ElementTree(root).write(plain)
             lanelets, errors = lanelet2.io.loadRobust(str(plain), projector)
         except RuntimeError as error:
             raise TileError(f"{source}: not a Lanelet2 map ({error})") from error
-    lanes = build_lane_map(_lanes(lanelets, lanelet2), str(source))
     skipped += [str(error).strip("\t -") for error in errors][1:]  # the first is a heading
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    skipped += _drop_odd_limits(lanelets, rules)
+    graph = lanelet2.routing.RoutingGraph(lanelets, rules)
+    lanes = build_lane_map(_lanes(lanelets, graph, rules), str(source))
     return _Built(lanes, origin if planar else projected_from, "", skipped)
 
 
@@ -107,23 +113,40 @@ def _middle(root: ElementTree.Element, source: Path) -> Origin:
     """The middle of all nodes, to the seventh decimal (a centimetre)."""
     nodes = root.findall("node")
     places = np.array([_numbers((node.get("lat"), node.get("lon")), source) for node in nodes])
-    latitude_deg, longitude_deg = (places.min(axis=0) + places.max(axis=0)) / 2.0
-    return round(float(latitude_deg), 7), round(float(longitude_deg), 7)
+    if (farthest := np.abs(places[:, 0]).max()) > 90.0:
+        raise TileError(
+            f"{source}: a node's latitude is {farthest:g} degrees away from the equator, expected "
+            "90 at most; are latitude and longitude swapped?"
+        )
+    # All around the first node, so that none lies beyond the antimeridian as seen from another.
+    places[:, 1] -= 360.0 * np.round((places[:, 1] - places[0, 1]) / 360.0)
+    latitude_deg, longitude_deg = ((places.min(axis=0) + places.max(axis=0)) / 2.0).tolist()
+    return round(latitude_deg, 7), round(math.remainder(longitude_deg, 360.0), 7)
 
 
 def _numbers(texts: tuple[str | None, str | None], source: Path) -> tuple[float, float]:
     try:
-        return float(texts[0] or ""), float(texts[1] or "")
-    except ValueError as error:
+        numbers = float(texts[0] or ""), float(texts[1] or "")
+    except ValueError:
+        numbers = (math.nan, math.nan)
+    if not all(map(math.isfinite, numbers)):
         raise TileError(
             f"{source}: a node's place is {texts}, expected two numbers: latitude and longitude, "
             "or local_x and local_y on every node"
-        ) from error
+        )
+    return numbers
 
 
 def _near_null_island(middle: Origin) -> bool:
     """Whether the map lies in the ocean at (0, 0): a local map, drawn where no roads are."""
     return max(map(abs, middle)) < 0.5  # degrees, 55 km
+
+
+def _lay_flat(root: ElementTree.Element) -> None:
+    """Forget heights: the library would move what lies high outwards, 0.35 m per kilometre each."""
+    for node in root.findall("node"):
+        for tag in node.findall("tag[@k='ele']"):
+            node.remove(tag)
 
 
 def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bool:
@@ -141,22 +164,46 @@ def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bo
         x_m, y_m = _numbers(pair, source)
         point = projector.reverse(lanelet2.core.BasicPoint3d(x_m, y_m, 0.0))
         node.attrib.update(lat=f"{point.lat:.12f}", lon=f"{point.lon:.12f}")
-        for tag in node.findall("tag[@k='ele']"):
-            node.remove(tag)
         ElementTree.SubElement(node, "tag", k="ele", v=f"{point.alt:.6f}")
     return True
 
 
-def _lanes(lanelets: Any, lanelet2: Any) -> Iterator[Lane]:
+def _drop_odd_limits(lanelets: Any, rules: Any) -> list[str]:
+    """Forget the speed limits that are none, and name them.
+
+    The library takes words for 0 km/h, and its routing graph fails on a sign that it does not know.
+    """
+    dropped = []
+    for lanelet in _by_id(lanelets):
+        stated = {k: v for k, v in lanelet.attributes.items() if k.startswith("speed_limit")}
+        signs = list(lanelet.regulatoryElements)
+        if (stated or signs) and not 0.0 < _stated_kmh(lanelet, rules) < 1000.0:
+            said = ", ".join(stated.values()) or "what its sign says"
+            dropped.append(f"speed limit of lanelet {lanelet.id}: {said} is not a known speed")
+            for key in stated:
+                del lanelet.attributes[key]
+            for sign in signs:
+                lanelet.removeRegulatoryElement(sign)
+    return dropped
+
+
+def _stated_kmh(lanelet: Any, rules: Any) -> float:
+    try:
+        return float(rules.speedLimit(lanelet).speedLimit)
+    except RuntimeError:
+        return math.nan
+
+
+def _lanes(lanelets: Any, graph: Any, rules: Any) -> Iterator[Lane]:
     """Lanes that vehicles may drive; a lanelet open both ways gives two, the second as -id."""
-    rules = lanelet2.traffic_rules.create(
-        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
-    )
-    graph = lanelet2.routing.RoutingGraph(lanelets, rules)
-    for lanelet in sorted(lanelets.laneletLayer, key=lambda lanelet: int(lanelet.id)):
+    for lanelet in _by_id(lanelets):
         for way in (lanelet, lanelet.invert()):
             if rules.canPass(way):
                 yield _lane(way, graph, rules)
+
+
+def _by_id(lanelets: Any) -> list[Any]:
+    return sorted(lanelets.laneletLayer, key=lambda lanelet: int(lanelet.id))
 
 
 def _lane(way: Any, graph: Any, rules: Any) -> Lane:
