@@ -314,6 +314,7 @@ def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
         (osm(LOCAL), "no lanes for vehicles"),
         (osm(LOCAL, lanelet(21, 11, 12, subtype="walkway")), "no lanes for vehicles"),
         (osm(local_node(1, 4e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
+        (osm(local_node(1, 1e15, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
         (osm(LOCAL.replace('v="20"', 'v="twenty"'), *ROAD), "a node's place is ('twenty', '4')"),
     ],
 )

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import TileError
-from eqrt.core.lanes import MAX_COORDINATE_M, NO_LANE, LaneMap, LaneType
+from eqrt.core.lanes import MAX_COORDINATE_M, MAX_SPEED_LIMIT_MPS, NO_LANE, LaneMap, LaneType
 
 MAGIC = b"EQRTTILE"
 VERSION = 1
@@ -190,7 +190,7 @@ def _check(lane_map: LaneMap, counts: _Counts, where: str) -> None:
         "a lane type is not known": not _within(lane_map.lane_type, 0, len(LaneType)),
         "lane ids come twice": len(np.unique(lane_map.lane_id)) != lanes,
         "points lie too far out": not (np.abs(lane_map.points) <= MAX_COORDINATE_M).all(),
-        "a speed limit is not sensible": bool(((speed < 0) | (speed > 1e3)).any()),
+        "a speed limit is not sensible": bool(((speed < 0) | (speed > MAX_SPEED_LIMIT_MPS)).any()),
     }
     for fault, found in faults.items():
         if found:
