@@ -210,6 +210,37 @@ def test_local_x_and_y_are_kept(write: Write, offset: tuple[float, float]) -> No
     assert np.isnan(info.origin_latitude_deg)
 
 
+def with_local(nodes: str, turn_rad: float) -> str:
+    """`local_x` and `local_y` beside `nodes`' latitude and longitude, in a grid that is turned."""
+    for node, (x, y) in PLACES.items():
+        grid = (x + 1j * y) * complex(math.cos(turn_rad), math.sin(turn_rad))
+        local = tagged({"local_x": str(grid.real), "local_y": str(grid.imag)})
+        head, tail = nodes.split(f'<node id="{node}"')
+        nodes = f'{head}<node id="{node}"' + tail.replace("</node>", f"{local}</node>", 1)
+    return nodes
+
+
+def test_an_origin_that_local_x_and_y_do_not_have_is_refused(write: Write) -> None:
+    """A grid turned by 2 degrees is 1.4 m off at 40 m; latitude and longitude tell."""
+    nodes, turn_rad = global_nodes(49.0, 8.4), math.radians(2.0)
+    lane_map, info, _ = build(write(osm(with_local(nodes, 0.0), *ROAD)), (49.0, 8.4))
+    assert info.origin_latitude_deg == 49.0
+    np.testing.assert_allclose(lane_map.points[[0, -1]], [[0, 2], [40, 2]], atol=1e-4)
+    turned = write(osm(with_local(nodes, turn_rad), *ROAD))
+    with pytest.raises(TileError, match=r"local_y of node 5 lie 1\.\d m from its latitude"):
+        build_tile(turned, (49.0, 8.4), None)
+    with pytest.raises(TileError, match=r"local_y of node 1 lie 1\d+\.\d m from its latitude"):
+        build_tile(write(osm(with_local(nodes, 0.0), *ROAD)), (49.001, 8.4), None)
+    _, info, _ = build(turned)  # nothing is claimed
+    assert info.origin_deg is None
+
+
+def test_a_way_back_whose_id_is_taken_is_refused(write: Write) -> None:
+    path = write(osm(LOCAL, lanelet(21, 11, 12, one_way="no"), lanelet(-21, 13, 14)))
+    with pytest.raises(TileError, match="lanelet 21 is open both ways, and -21, the id of its way"):
+        build_tile(path, None, None)
+
+
 def test_speed_limits_are_the_maps_own(write: Write) -> None:
     stated = lanelet(21, 11, 12, speed_limit="36 km/h", subtype="highway")
     lane_map, _, _ = build(write(osm(LOCAL, stated, lanelet(22, 13, 14))))

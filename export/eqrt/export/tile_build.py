@@ -28,6 +28,10 @@ from eqrt.training.recordings.commonroad import read_scenario
 
 Origin = tuple[float, float]
 """Latitude and longitude in degrees, WGS 84."""
+Place = tuple[float, float]
+"""x and y in metres, map frame."""
+
+_SAME_PLACE_M = 1.0
 
 
 def build_tile(source: Path, origin: Origin | None, credit: str | None) -> tuple[bytes, list[str]]:
@@ -78,9 +82,11 @@ def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
     root = read_osm(source)
     skipped = keep_lanelets(root)
     _lay_flat(root)
-    planar = _move_to_plane(root, source, lanelet2) or _near_null_island(_middle(root, source))
+    planar = _move_to_plane(root, source, origin, lanelet2) or _near_null_island(
+        _middle(root, source)
+    )
     projected_from = (0.0, 0.0) if planar else origin or _middle(root, source)
-    projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*projected_from))
+    projector = _projector(projected_from, lanelet2)
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder, "map.osm")
         try:
@@ -94,7 +100,7 @@ def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
     )
     skipped += _drop_odd_limits(lanelets, rules)
     graph = lanelet2.routing.RoutingGraph(lanelets, rules)
-    lanes = build_lane_map(_lanes(lanelets, graph, rules), str(source))
+    lanes = build_lane_map(_lanes(lanelets, graph, rules, source), str(source))
     return _Built(lanes, origin if planar else projected_from, "", skipped)
 
 
@@ -107,6 +113,10 @@ def _import_lanelet2() -> Any:
             "install it with: pip install 'eqrt[maps]'"
         ) from error
     return lanelet2
+
+
+def _projector(origin: Origin, lanelet2: Any) -> Any:
+    return lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*origin))
 
 
 def _middle(root: ElementTree.Element, source: Path) -> Origin:
@@ -152,7 +162,9 @@ def _lay_flat(root: ElementTree.Element) -> None:
             node.remove(tag)
 
 
-def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bool:
+def _move_to_plane(
+    root: ElementTree.Element, source: Path, origin: Origin | None, lanelet2: Any
+) -> bool:
     """Whether all nodes have `local_x` and `local_y`; if so, they become the nodes' places.
 
     The library projects latitude and longitude whatever the file says, so they are set to what it
@@ -162,13 +174,44 @@ def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bo
     texts = [(tag_value(node, "local_x"), tag_value(node, "local_y")) for node in nodes]
     if any(None in pair for pair in texts):
         return False
-    projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(0.0, 0.0))
-    for node, pair in zip(nodes, texts, strict=True):
-        x_m, y_m = _numbers(pair, source)
+    places = [_numbers(pair, source) for pair in texts]
+    if origin is not None:
+        _check_origin(nodes, places, source, origin, lanelet2)
+    projector = _projector((0.0, 0.0), lanelet2)
+    for node, (x_m, y_m) in zip(nodes, places, strict=True):
         point = projector.reverse(lanelet2.core.BasicPoint3d(x_m, y_m, 0.0))
         node.attrib.update(lat=f"{point.lat:.12f}", lon=f"{point.lon:.12f}")
         ElementTree.SubElement(node, "tag", k="ele", v=f"{point.alt:.6f}")
     return True
+
+
+def _check_origin(
+    nodes: list[ElementTree.Element],
+    places: list[Place],
+    source: Path,
+    origin: Origin,
+    lanelet2: Any,
+) -> None:
+    """Raise TileError if nodes that also have latitude and longitude show another plane.
+
+    A UTM or MGRS grid is turned against north, by up to 3 degrees.
+    """
+    projector = _projector(origin, lanelet2)
+    for node, (x_m, y_m) in zip(nodes, places, strict=True):
+        try:
+            stated = float(node.get("lat", "")), float(node.get("lon", ""))
+        except ValueError:
+            continue
+        if _near_null_island(stated):
+            continue
+        point = projector.forward(lanelet2.core.GPSPoint(*stated, 0.0))
+        off_m = math.hypot(point.x - x_m, point.y - y_m)
+        if off_m > _SAME_PLACE_M:
+            raise TileError(
+                f"{source}: local_x and local_y of node {node.get('id')} lie {off_m:.1f} m from "
+                "its latitude and longitude as seen from that origin; choose the one where x = y "
+                "= 0 and x leads east, or remove local_x and local_y from the map"
+            )
 
 
 def _drop_odd_limits(lanelets: Any, rules: Any) -> list[str]:
@@ -197,11 +240,17 @@ def _stated_kmh(lanelet: Any, rules: Any) -> float:
         return math.nan
 
 
-def _lanes(lanelets: Any, graph: Any, rules: Any) -> Iterator[Lane]:
+def _lanes(lanelets: Any, graph: Any, rules: Any, source: Path) -> Iterator[Lane]:
     """Lanes that vehicles may drive; a lanelet open both ways gives two, the second as -id."""
+    ids = {int(lanelet.id) for lanelet in lanelets.laneletLayer}
     for lanelet in _by_id(lanelets):
         for way in (lanelet, lanelet.invert()):
             if rules.canPass(way):
+                if way.inverted() and _lane_id(way) in ids:
+                    raise TileError(
+                        f"{source}: lanelet {way.id} is open both ways, and {_lane_id(way)}, the "
+                        "id of its way back, is another lanelet's; renumber one of them"
+                    )
                 yield _lane(way, graph, rules)
 
 
