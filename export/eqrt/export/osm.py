@@ -47,15 +47,18 @@ def keep_lanelets(root: Element) -> list[str]:
     limits = {
         relation.get("id") for relation in root.findall("relation") if _is_limit(relation, ways)
     }
-    kept = {"way": ways, "relation": limits}
-    for child in list(root):
+    whole = {"node": nodes, "way": ways, "relation": limits}
+    kept = []
+    for child in root:
         if child.tag == "relation" and tag_value(child, "type") == "lanelet":
             if fault := _fault(child, ways):
                 dropped.append(f"lanelet {child.get('id')} {fault}")
-                root.remove(child)
+                continue
             _unlink(child, limits)
-        elif child.get("id") not in kept.get(child.tag, nodes):
-            root.remove(child)
+        elif child.get("id") not in whole[child.tag]:
+            continue
+        kept.append(child)
+    root[:] = kept  # at once: to remove one by one takes minutes where there are many
     return dropped
 
 
