@@ -65,6 +65,13 @@ def test_a_map_comes_back_as_it_was(name: str) -> None:
     assert replace(info, tile_id="") == INFO
 
 
+def test_names_that_are_no_text_do_not_keep_a_tile_from_being_written() -> None:
+    """As Linux gives a file name that is not UTF-8, such as a Latin-1 Zürich."""
+    odd = replace(INFO, source="Z\udcfcrich.osm", credit="Z\udcfcrich")
+    _, info = decode(encode(two_lanes(), odd), "test")
+    assert (info.source, info.credit) == ("Z?rich.osm", "Z?rich")
+
+
 def test_values_that_can_be_checked_by_hand_come_back() -> None:
     lanes, _ = decode(TILE, "test")
     assert lanes.lane_id.tolist() == [7, 9]

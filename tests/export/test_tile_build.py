@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import functools
 import gzip
+import math
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError, TileError
 from eqrt.core.lanes import NO_LANE, LaneMap, LaneType
 from eqrt.core.tile import TileInfo, decode
+from eqrt.export.osm import keep_lanelets
 from eqrt.export.tile_build import Origin, build_tile
 from eqrt.runtime.prediction.tiles import load_tile
 
@@ -56,6 +60,16 @@ def lanelet(lanelet_id: int, left: int, right: int, **tags: str) -> str:
 
 def tagged(tags: dict[str, str]) -> str:
     return "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+
+
+def global_nodes(latitude_deg: float, longitude_deg: float, **tags: str) -> str:
+    """The nodes of `PLACES` with (0, 0) there: a degree of latitude is about 111 km."""
+    nodes = []
+    for node, (x_m, y_m) in PLACES.items():
+        lat = latitude_deg + y_m / 111e3
+        lon = longitude_deg + x_m / (111e3 * math.cos(math.radians(latitude_deg)))
+        nodes.append(f'<node id="{node}" lat="{lat}" lon="{lon}">{tagged(tags)}</node>')
+    return "".join(nodes)
 
 
 def local_node(node: int, x_m: float, y_m: float) -> str:
@@ -150,6 +164,32 @@ def test_without_an_origin_the_middle_of_the_map_is_zero() -> None:
     assert 8.41 < info.origin_longitude_deg < 8.46
 
 
+@pytest.mark.parametrize("west_deg", [179.9999, -180.0001])
+def test_a_map_across_the_antimeridian_has_its_origin_there(write: Write, west_deg: float) -> None:
+    """20 m west of it to 20 m east of it, where a degree of longitude is 106.5 km."""
+    nodes = ""
+    for node, (x, y) in PLACES.items():
+        longitude_deg = math.remainder(west_deg + x / 106.5e3, 360.0)
+        nodes += f'<node id="{node}" lat="{-17.0 + y / 110.7e3}" lon="{longitude_deg}"/>'
+    lane_map, info, _ = build(write(osm(nodes, *ROAD)))
+    assert abs(info.origin_longitude_deg) == pytest.approx(179.9999122, abs=2e-7)
+    np.testing.assert_allclose(lane_map.points[[0, -1]], [[-20, 0], [20, 0]], atol=0.02)
+
+
+def test_longitudes_beyond_180_degrees_are_those_of_the_other_side(write: Write) -> None:
+    west, _, _ = build(write(osm(global_nodes(-17.0, -170.0), *ROAD)))
+    east, info, _ = build(write(osm(global_nodes(-17.0, 190.0), *ROAD)))
+    assert info.origin_longitude_deg == pytest.approx(-169.9998, abs=1e-4)
+    np.testing.assert_allclose(east.points, west.points, atol=0.01)
+
+
+def test_heights_do_not_move_the_map(write: Write) -> None:
+    """5 km from the origin, 2,240 m (Mexico City) would move it outwards by 1.76 m."""
+    flat, _, _ = build(write(osm(global_nodes(19.4, -99.1), *ROAD)), (19.4, -99.15))
+    high = osm(global_nodes(19.4, -99.1, ele="2240"), *ROAD)
+    np.testing.assert_array_equal(build(write(high), (19.4, -99.15))[0].points, flat.points)
+
+
 def test_a_map_around_latitude_and_longitude_zero_keeps_its_plane() -> None:
     """Town10HD spans 225 by 210 m around CARLA's own origin."""
     lane_map, info, _ = town10hd()
@@ -173,11 +213,114 @@ def test_local_x_and_y_are_kept(write: Write, offset: tuple[float, float]) -> No
     assert np.isnan(info.origin_latitude_deg)
 
 
+def with_local(nodes: str, turn_rad: float) -> str:
+    """`local_x` and `local_y` beside `nodes`' latitude and longitude, in a grid that is turned."""
+    for node, (x, y) in PLACES.items():
+        grid = (x + 1j * y) * complex(math.cos(turn_rad), math.sin(turn_rad))
+        local = tagged({"local_x": str(grid.real), "local_y": str(grid.imag)})
+        head, tail = nodes.split(f'<node id="{node}"')
+        nodes = f'{head}<node id="{node}"' + tail.replace("</node>", f"{local}</node>", 1)
+    return nodes
+
+
+def test_an_origin_that_local_x_and_y_do_not_have_is_refused(write: Write) -> None:
+    """A grid turned by 2 degrees is 1.4 m off at 40 m; latitude and longitude tell."""
+    nodes, turn_rad = global_nodes(49.0, 8.4), math.radians(2.0)
+    lane_map, info, _ = build(write(osm(with_local(nodes, 0.0), *ROAD)), (49.0, 8.4))
+    assert info.origin_latitude_deg == 49.0
+    np.testing.assert_allclose(lane_map.points[[0, -1]], [[0, 2], [40, 2]], atol=1e-4)
+    turned = write(osm(with_local(nodes, turn_rad), *ROAD))
+    with pytest.raises(TileError, match=r"local_y of node 5 lie 1\.\d m from its latitude"):
+        build_tile(turned, (49.0, 8.4), None)
+    with pytest.raises(TileError, match=r"local_y of node 1 lie 1\d+\.\d m from its latitude"):
+        build_tile(write(osm(with_local(nodes, 0.0), *ROAD)), (49.001, 8.4), None)
+    _, info, _ = build(turned)  # nothing is claimed
+    assert info.origin_deg is None
+
+
+def test_a_way_back_whose_id_is_taken_is_refused(write: Write) -> None:
+    path = write(osm(LOCAL, lanelet(21, 11, 12, one_way="no"), lanelet(-21, 13, 14)))
+    with pytest.raises(TileError, match="lanelet 21 is open both ways, and -21, the id of its way"):
+        build_tile(path, None, None)
+
+
 def test_speed_limits_are_the_maps_own(write: Write) -> None:
     stated = lanelet(21, 11, 12, speed_limit="36 km/h", subtype="highway")
     lane_map, _, _ = build(write(osm(LOCAL, stated, lanelet(22, 13, 14))))
     np.testing.assert_allclose(lane_map.speed_limit_mps, [10.0, np.nan])
     assert lane_map.lane_type.tolist() == [LaneType.HIGHWAY, LaneType.URBAN]
+
+
+SIGN = (
+    '<relation id="31"><tag k="type" v="regulatory_element"/>'
+    '<tag k="subtype" v="speed_limit"/><tag k="sign_type" v="{}"/></relation>'
+)
+SIGNED = ROAD[0].replace(
+    "</relation>", '<member type="relation" ref="31" role="regulatory_element"/></relation>'
+)
+
+
+@pytest.mark.parametrize("said", ["none", "walk", "-30", "0", "5000", "nan"])
+def test_a_speed_limit_that_is_none_is_not_known(write: Write, said: str) -> None:
+    odd = lanelet(21, 11, 12, speed_limit=said)
+    lane_map, _, skipped = build(write(osm(LOCAL, odd, lanelet(22, 13, 14, speed_limit="36"))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [np.nan, 10.0])
+    assert lane_map.successors_of(0).tolist() == [1]
+    assert skipped == [f"speed limit of lanelet 21: {said} is not a known speed"]
+
+
+def test_a_sign_that_is_not_known_costs_its_speed_limit_only(write: Write) -> None:
+    lane_map, _, skipped = build(write(osm(LOCAL, SIGNED, ROAD[1], SIGN.format("36 km/h"))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [10.0, np.nan])
+    assert skipped == []
+    lane_map, _, skipped = build(write(osm(LOCAL, SIGNED, ROAD[1], SIGN.format("R2-1"))))
+    np.testing.assert_allclose(lane_map.speed_limit_mps, [np.nan, np.nan])
+    assert lane_map.successors_of(0).tolist() == [1]
+    assert skipped == ["speed limit of lanelet 21: what its sign says is not a known speed"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ('<relation id="22"', '<relation id="21"', "relation 21 comes again"),
+        ('<way id="14"', '<way id="12"', "way 12 comes again"),
+        ('<relation id="22"', "<relation", "relation '': its id is not a whole number"),
+        ('"13"', '"left side"', "way 'left side': its id is not a whole number"),
+        ('id="22"', 'id="9223372036854775808"', "'9223372036854775808': its id is not"),
+        ('"way" ref="13"', '"node" ref="1"', "lanelet 22 has a left bound that is not there"),
+        ('<way id="14"', '<way action="delete" id="14"', "not whole (way 14)"),
+        ('<node id="6"', '<node action="delete" id="6"', "not whole (way 14)"),
+    ],
+)
+def test_what_would_crash_the_library_is_left_out_and_named(
+    write: Write, before: str, after: str, said: str
+) -> None:
+    """In a process of its own, that a crash does not end the tests."""
+    source = write(osm(LOCAL, *ROAD).replace(before, after))
+    out = source.with_suffix(".tile")
+    command = [sys.executable, "-m", "eqrt", "tile", "build", str(source), "--out", str(out)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert said in done.stderr
+    assert load_tile(out).lane_map.lane_id.tolist() == [21]
+
+
+def test_a_deleted_lanelet_is_no_lane_and_no_loss(write: Write) -> None:
+    gone = ROAD[1].replace("<relation", "<relation action='delete'")
+    lane_map, _, skipped = build(write(osm(LOCAL, ROAD[0], gone)))
+    assert lane_map.lane_id.tolist() == [21]
+    assert skipped == []
+
+
+def test_what_a_city_has_besides_lanelets_is_left_out_in_no_time() -> None:
+    """40,000 nodes and 20,000 traffic lights: removed one by one, they took half a minute."""
+    nodes = "".join(local_node(node, 0.0, 0.0) for node in range(1, 40_001))
+    lights = "".join(f'<relation id="{light}"/>' for light in range(100, 20_100))
+    root = ElementTree.fromstring(osm(nodes, *ROAD, lights))
+    begin_s = time.perf_counter()
+    assert keep_lanelets(root) == []
+    assert time.perf_counter() - begin_s < 10.0
+    assert [lane.get("id") for lane in root.findall("relation")] == ["21", "22"]
 
 
 def test_broken_lanelets_are_left_out_and_named(write: Write) -> None:
@@ -208,9 +351,15 @@ def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
         ("<commonRoad/>", "the root is <commonRoad>, expected <osm> with nodes"),
         ("<osm version='0.6'/>", "expected <osm> with nodes"),
         (osm('<node id="1" lat="" lon=""/>'), "a node's place is ('', ''), expected two numbers"),
+        ('<?xml version="1.0" encoding="klingon"?><osm/>', "not XML (unknown encoding: klingon)"),
+        ('<?xml version="1.0" encoding="shift_jis"?><osm/>', "not XML (multi-byte encodings"),
+        (osm(LOCAL.replace("</node>", "<a>" * 9999 + "</a>" * 9999 + "</node>")), "recursion"),
+        (osm(global_nodes(139.7, 35.7), *ROAD), "are latitude and longitude swapped?"),
+        (osm(LOCAL.replace('v="20"', 'v="nan"'), *ROAD), "a node's place is ('nan', '4')"),
         (osm(LOCAL), "no lanes for vehicles"),
         (osm(LOCAL, lanelet(21, 11, 12, subtype="walkway")), "no lanes for vehicles"),
         (osm(local_node(1, 4e5, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
+        (osm(local_node(1, 1e15, 0) + LOCAL[LOCAL.index('<node id="2"') :], *ROAD), "131 km"),
         (osm(LOCAL.replace('v="20"', 'v="twenty"'), *ROAD), "a node's place is ('twenty', '4')"),
     ],
 )

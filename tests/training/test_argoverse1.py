@@ -270,6 +270,7 @@ MAP = city_map()
 BROKEN_MAPS = {
     "cut": (MAP[:-40], "not XML"),
     "empty": (" ", "not XML"),
+    "encoding": ("<?xml version='1.0' encoding='klingon'?>" + MAP, "not XML .unknown encoding"),
     "another format": ("<commonRoad><lanelet id='1' /></commonRoad>", "no lanes for vehicles"),
     "plain OpenStreetMap": ("<osm><way id='1'><nd ref='1'/></way></osm>", "lane_id of a way"),
     "node": (MAP.replace('<node id="0"', '<node id="99"'), "lane 9601: node 0 is missing"),

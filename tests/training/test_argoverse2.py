@@ -237,6 +237,7 @@ BROKEN_MAPS = {
     "NaN": (log_map(segment(1, (0, 0), (np.nan, 0))), "JSON is malformed"),
     "point": (log_map(segment(1, centerline=[{"x": 1.0}])), "missing required field `y`"),
     "far away": (log_map(segment(1, (0, 0), (5e6, 0))), "lane 1 lies more than"),
+    "farther": (log_map(segment(1, (0, 0), (1e30, 0))), "lane 1 lies more than"),
 }
 
 

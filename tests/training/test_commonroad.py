@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eqrt.core.errors import LogError
+from eqrt.core.errors import LogError, TileError
 from eqrt.core.lanes import NO_LANE, LaneType
 from eqrt.training.recordings.commonroad import lane_map, read_scenario
 
@@ -159,6 +159,27 @@ def test_connections_are_mended_and_unknown_ones_dropped(write: Callable[[str], 
     assert lanes.lane_type[1] == LaneType.HIGHWAY
 
 
+@pytest.mark.parametrize("word", ["sidewalk", "crosswalk", "bicycleLane"])
+def test_lanelets_that_no_vehicle_drives_on_are_no_lanes(
+    write: Callable[[str], Path], word: str
+) -> None:
+    words = f"<laneletType>intersection</laneletType><laneletType>{word}</laneletType>"
+    drawn = SCENARIO.replace('<adjacentLeft ref="1" drivingDir="same"/>', words)
+    lanes = lane_map(read_scenario(write(drawn)))
+    assert lanes.lane_id.tolist() == [1, 2, 3]
+    assert lanes.right.tolist() == [NO_LANE, NO_LANE, NO_LANE]
+
+
+def test_of_several_types_the_one_for_vehicles_counts(write: Callable[[str], Path]) -> None:
+    words = "".join(
+        f"<laneletType>{word}</laneletType>" for word in ("intersection", "bicycleLane", "urban")
+    )
+    drawn = SCENARIO.replace("<laneletType>interstate</laneletType>", words)
+    lanes = lane_map(read_scenario(write(drawn)))
+    assert lanes.num_lanes == 4
+    assert lanes.lane_type[1] == LaneType.URBAN
+
+
 def test_a_lanelet_that_comes_twice_counts_once(write: Callable[[str], Path]) -> None:
     twice = SCENARIO.replace("</commonRoad>", f"{LANELETS}</commonRoad>")
     assert lane_map(read_scenario(write(twice))).num_lanes == 4
@@ -176,6 +197,7 @@ def test_a_gzipped_scenario_is_told_by_its_bytes(write: Callable[[bytes], Path])
         (b"", "not XML"),
         (b"\x00\xff\xfe no text", "not XML"),
         (SCENARIO[:-30], "not XML"),
+        ('<?xml version="1.0" encoding="klingon"?><commonRoad/>', "not XML (unknown encoding"),
         ("<osm/>", "the root is <osm>"),
         (SCENARIO.replace("2020a", "2017a"), "CommonRoad 2017a is not supported"),
         (SCENARIO.replace(LANELETS, ""), "no lanelets"),
@@ -200,6 +222,26 @@ def test_a_broken_scenario_is_one_line_that_names_the_file(
         read_scenario(path)
     assert message in str(caught.value)
     assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("<x>20</x>", "<x>5e5</x>", "lane 2 lies more than 131 km"),
+        ("<x>20</x>", "<x>1e30</x>", "lane 2 lies more than 131 km"),
+        ("<x>20</x>", "<x>10</x>", "lane 2 is shorter than 1 cm"),
+        ("13.5", "-13.5", "lane 1 has a speed limit of -13.5 m/s, expected 0 to 1000"),
+        ('id="2"', 'id="9223372036854775808"', "lane id 9223372036854775808 has more than 64 bits"),
+    ],
+)
+def test_lanes_that_cannot_be_are_one_line_that_names_the_file(
+    write: Callable[[str], Path], before: str, after: str, message: str
+) -> None:
+    scenario = read_scenario(write(SCENARIO.replace(before, after)))
+    with pytest.raises(TileError) as caught:
+        lane_map(scenario)
+    assert str(caught.value).startswith(f"{scenario.path}: {message}")
     assert "\n" not in str(caught.value)
 
 

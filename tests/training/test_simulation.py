@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import importlib.resources
 import json
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -169,6 +171,16 @@ def test_a_network_that_is_none_is_refused(net: Callable[..., Path], tmp_path: P
     (tmp_path / "n.xml").write_text("town")
     with pytest.raises(LogError, match="not a SUMO network"):
         read_sumo_lanes(tmp_path / "n.xml")
+    whole = net(CORNER, WAYS).read_bytes()
+    damaged = {
+        "encoding": whole.replace(b"UTF-8", b"klingon"),
+        "shape": re.sub(rb'shape="[^"]*"', b'shape=""', whole),
+        "cut": gzip.compress(whole)[:-20],
+    }
+    for what, data in damaged.items():
+        (tmp_path / f"{what}.net.xml").write_bytes(data)
+        with pytest.raises(LogError, match=rf"{what}\.net\.xml: not a SUMO network"):
+            read_sumo_lanes(tmp_path / f"{what}.net.xml")
     with pytest.raises(TileError, match="no lanes for vehicles"):
         read_sumo_lanes(net(CORNER[:2], ['id="ab" from="a" to="b" allow="pedestrian"']))
 

@@ -28,6 +28,10 @@ from eqrt.training.recordings.commonroad import read_scenario
 
 Origin = tuple[float, float]
 """Latitude and longitude in degrees, WGS 84."""
+Place = tuple[float, float]
+"""x and y in metres, map frame."""
+
+_SAME_PLACE_M = 1.0
 
 
 def build_tile(source: Path, origin: Origin | None, credit: str | None) -> tuple[bytes, list[str]]:
@@ -77,18 +81,26 @@ def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
     lanelet2 = _import_lanelet2()
     root = read_osm(source)
     skipped = keep_lanelets(root)
-    planar = _move_to_plane(root, source, lanelet2) or _near_null_island(_middle(root, source))
+    _lay_flat(root)
+    planar = _move_to_plane(root, source, origin, lanelet2) or _near_null_island(
+        _middle(root, source)
+    )
     projected_from = (0.0, 0.0) if planar else origin or _middle(root, source)
-    projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*projected_from))
+    projector = _projector(projected_from, lanelet2)
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder, "map.osm")
-        ElementTree.ElementTree(root).write(plain)
         try:
+            ElementTree.ElementTree(root).write(plain)
             lanelets, errors = lanelet2.io.loadRobust(str(plain), projector)
         except RuntimeError as error:
             raise TileError(f"{source}: not a Lanelet2 map ({error})") from error
-    lanes = build_lane_map(_lanes(lanelets, lanelet2), str(source))
     skipped += [str(error).strip("\t -") for error in errors][1:]  # the first is a heading
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    skipped += _drop_odd_limits(lanelets, rules)
+    graph = lanelet2.routing.RoutingGraph(lanelets, rules)
+    lanes = build_lane_map(_lanes(lanelets, graph, rules, source), str(source))
     return _Built(lanes, origin if planar else projected_from, "", skipped)
 
 
@@ -103,22 +115,36 @@ def _import_lanelet2() -> Any:
     return lanelet2
 
 
+def _projector(origin: Origin, lanelet2: Any) -> Any:
+    return lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(*origin))
+
+
 def _middle(root: ElementTree.Element, source: Path) -> Origin:
     """The middle of all nodes, to the seventh decimal (a centimetre)."""
     nodes = root.findall("node")
     places = np.array([_numbers((node.get("lat"), node.get("lon")), source) for node in nodes])
-    latitude_deg, longitude_deg = (places.min(axis=0) + places.max(axis=0)) / 2.0
-    return round(float(latitude_deg), 7), round(float(longitude_deg), 7)
+    if (farthest := np.abs(places[:, 0]).max()) > 90.0:
+        raise TileError(
+            f"{source}: a node's latitude is {farthest:g} degrees away from the equator, expected "
+            "90 at most; are latitude and longitude swapped?"
+        )
+    # All around the first node, so that none lies beyond the antimeridian as seen from another.
+    places[:, 1] -= 360.0 * np.round((places[:, 1] - places[0, 1]) / 360.0)
+    latitude_deg, longitude_deg = ((places.min(axis=0) + places.max(axis=0)) / 2.0).tolist()
+    return round(latitude_deg, 7), round(math.remainder(longitude_deg, 360.0), 7)
 
 
 def _numbers(texts: tuple[str | None, str | None], source: Path) -> tuple[float, float]:
     try:
-        return float(texts[0] or ""), float(texts[1] or "")
-    except ValueError as error:
+        numbers = float(texts[0] or ""), float(texts[1] or "")
+    except ValueError:
+        numbers = (math.nan, math.nan)
+    if not all(map(math.isfinite, numbers)):
         raise TileError(
             f"{source}: a node's place is {texts}, expected two numbers: latitude and longitude, "
             "or local_x and local_y on every node"
-        ) from error
+        )
+    return numbers
 
 
 def _near_null_island(middle: Origin) -> bool:
@@ -126,7 +152,19 @@ def _near_null_island(middle: Origin) -> bool:
     return max(map(abs, middle)) < 0.5  # degrees, 55 km
 
 
-def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bool:
+def _lay_flat(root: ElementTree.Element) -> None:
+    """Forget heights: the tile's plane has none, and neither have the poses brought to it.
+
+    The library would move what lies 1 km high outwards by 0.16 m per km from the origin.
+    """
+    for node in root.findall("node"):
+        for tag in node.findall("tag[@k='ele']"):
+            node.remove(tag)
+
+
+def _move_to_plane(
+    root: ElementTree.Element, source: Path, origin: Origin | None, lanelet2: Any
+) -> bool:
     """Whether all nodes have `local_x` and `local_y`; if so, they become the nodes' places.
 
     The library projects latitude and longitude whatever the file says, so they are set to what it
@@ -136,27 +174,88 @@ def _move_to_plane(root: ElementTree.Element, source: Path, lanelet2: Any) -> bo
     texts = [(tag_value(node, "local_x"), tag_value(node, "local_y")) for node in nodes]
     if any(None in pair for pair in texts):
         return False
-    projector = lanelet2.projection.LocalCartesianProjector(lanelet2.io.Origin(0.0, 0.0))
-    for node, pair in zip(nodes, texts, strict=True):
-        x_m, y_m = _numbers(pair, source)
+    places = [_numbers(pair, source) for pair in texts]
+    if origin is not None:
+        _check_origin(nodes, places, source, origin, lanelet2)
+    projector = _projector((0.0, 0.0), lanelet2)
+    for node, (x_m, y_m) in zip(nodes, places, strict=True):
         point = projector.reverse(lanelet2.core.BasicPoint3d(x_m, y_m, 0.0))
         node.attrib.update(lat=f"{point.lat:.12f}", lon=f"{point.lon:.12f}")
-        for tag in node.findall("tag[@k='ele']"):
-            node.remove(tag)
         ElementTree.SubElement(node, "tag", k="ele", v=f"{point.alt:.6f}")
     return True
 
 
-def _lanes(lanelets: Any, lanelet2: Any) -> Iterator[Lane]:
+def _check_origin(
+    nodes: list[ElementTree.Element],
+    places: list[Place],
+    source: Path,
+    origin: Origin,
+    lanelet2: Any,
+) -> None:
+    """Raise TileError if nodes that also have latitude and longitude show another plane.
+
+    A UTM or MGRS grid is turned against north, by up to 3 degrees.
+    """
+    projector = _projector(origin, lanelet2)
+    for node, (x_m, y_m) in zip(nodes, places, strict=True):
+        try:
+            stated = float(node.get("lat", "")), float(node.get("lon", ""))
+        except ValueError:
+            continue
+        if _near_null_island(stated):
+            continue
+        point = projector.forward(lanelet2.core.GPSPoint(*stated, 0.0))
+        off_m = math.hypot(point.x - x_m, point.y - y_m)
+        if off_m > _SAME_PLACE_M:
+            raise TileError(
+                f"{source}: local_x and local_y of node {node.get('id')} lie {off_m:.1f} m from "
+                "its latitude and longitude as seen from that origin; choose the one where x = y "
+                "= 0 and x leads east, or remove local_x and local_y from the map"
+            )
+
+
+def _drop_odd_limits(lanelets: Any, rules: Any) -> list[str]:
+    """Forget the speed limits that are none, and name them.
+
+    The library takes words for 0 km/h, and its routing graph fails on a sign that it does not know.
+    """
+    dropped = []
+    for lanelet in _by_id(lanelets):
+        stated = {k: v for k, v in lanelet.attributes.items() if k.startswith("speed_limit")}
+        signs = list(lanelet.regulatoryElements)
+        if (stated or signs) and not 0.0 < _stated_kmh(lanelet, rules) < 1000.0:
+            said = ", ".join(stated.values()) or "what its sign says"
+            dropped.append(f"speed limit of lanelet {lanelet.id}: {said} is not a known speed")
+            for key in stated:
+                del lanelet.attributes[key]
+            for sign in signs:
+                lanelet.removeRegulatoryElement(sign)
+    return dropped
+
+
+def _stated_kmh(lanelet: Any, rules: Any) -> float:
+    try:
+        return float(rules.speedLimit(lanelet).speedLimit)
+    except RuntimeError:
+        return math.nan
+
+
+def _lanes(lanelets: Any, graph: Any, rules: Any, source: Path) -> Iterator[Lane]:
     """Lanes that vehicles may drive; a lanelet open both ways gives two, the second as -id."""
-    rules = lanelet2.traffic_rules.create(
-        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
-    )
-    graph = lanelet2.routing.RoutingGraph(lanelets, rules)
-    for lanelet in sorted(lanelets.laneletLayer, key=lambda lanelet: int(lanelet.id)):
+    ids = {int(lanelet.id) for lanelet in lanelets.laneletLayer}
+    for lanelet in _by_id(lanelets):
         for way in (lanelet, lanelet.invert()):
             if rules.canPass(way):
+                if way.inverted() and _lane_id(way) in ids:
+                    raise TileError(
+                        f"{source}: lanelet {way.id} is open both ways, and {_lane_id(way)}, the "
+                        "id of its way back, is another lanelet's; renumber one of them"
+                    )
                 yield _lane(way, graph, rules)
+
+
+def _by_id(lanelets: Any) -> list[Any]:
+    return sorted(lanelets.laneletLayer, key=lambda lanelet: int(lanelet.id))
 
 
 def _lane(way: Any, graph: Any, rules: Any) -> Lane:

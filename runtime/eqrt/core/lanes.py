@@ -22,8 +22,13 @@ SPACING_M = 2.0
 """Distance between the points of a centerline, about."""
 MAX_COORDINATE_M = 131_072.0
 """float32 resolves 8 mm out to here; a map farther from its origin is refused."""
+MAX_SPEED_LIMIT_MPS = 1e3
 NO_LANE = -1
 """`left` or `right` where there is no neighbour."""
+
+_LONGEST_M = 4.0 * MAX_COORDINATE_M
+"""A line longer than this leads out of any map, and is not worth a point every `SPACING_M`."""
+_LARGEST_ID = 2**63 - 1
 
 
 class LaneType(IntEnum):
@@ -94,11 +99,12 @@ def build_lane_map(lanes: Iterable[Lane], where: str) -> LaneMap:
     """Flatten `lanes`, in their order; `where` names the source in errors.
 
     A lane id that comes again is dropped, and so are references to lanes that are not there.
-    Raises TileError if no lane is left, or one has no length or lies too far from the origin.
+    Raises TileError if no lane is left, or one has no length, lies too far from the origin, or has
+    an id or a speed limit that none can have.
     """
     unique: dict[int, Lane] = {}
     for lane in lanes:
-        _check_centerline(lane, where)
+        _check(lane, where)
         unique.setdefault(lane.lane_id, lane)
     if not unique:
         raise TileError(f"{where}: no lanes for vehicles; choose a map with drivable lanes")
@@ -124,15 +130,13 @@ def middle_line(left: Float64, right: Float64) -> Float64:
     Both bounds are walked at equal fractions of their length, about `SPACING_M` at a time.
     """
     length_m = (arclength(left)[-1] + arclength(right)[-1]) / 2.0
-    fraction = np.linspace(0.0, 1.0, max(2, round(length_m / SPACING_M) + 1))
+    fraction = _even_fractions(length_m)
     return (_at_fraction(left, fraction) + _at_fraction(right, fraction)) / 2.0
 
 
 def evenly_spaced(line: Float64) -> Float64:
     """(n, 2) the polyline (m, 2) with a point about every `SPACING_M`, its ends kept."""
-    along = arclength(line)
-    fraction = np.linspace(0.0, 1.0, max(2, round(along[-1] / SPACING_M) + 1))
-    return np.stack([np.interp(fraction * along[-1], along, axis) for axis in line.T], axis=-1)
+    return _at_fraction(line, _even_fractions(arclength(line)[-1]))
 
 
 def arclength(line: Float64) -> Float64:
@@ -140,19 +144,32 @@ def arclength(line: Float64) -> Float64:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
 
 
+def _even_fractions(length_m: float) -> Float64:
+    """(n,) 0 to 1, about every `SPACING_M` of a length."""
+    return np.linspace(0.0, 1.0, max(2, round(min(length_m, _LONGEST_M) / SPACING_M) + 1))
+
+
 def _at_fraction(line: Float64, fraction: Float64) -> Float64:
     along = arclength(line)
     return np.stack([np.interp(fraction * along[-1], along, axis) for axis in line.T], axis=-1)
 
 
-def _check_centerline(lane: Lane, where: str) -> None:
+def _check(lane: Lane, where: str) -> None:
+    if abs(lane.lane_id) > _LARGEST_ID:
+        raise TileError(f"{where}: lane id {lane.lane_id} has more than 64 bits; renumber the map")
     if not np.abs(lane.centerline).max(initial=0.0) <= MAX_COORDINATE_M:
         raise TileError(
             f"{where}: lane {lane.lane_id} lies more than {MAX_COORDINATE_M / 1e3:.0f} km from "
-            "the map's origin (or is not finite); choose an origin within the map"
+            "the map's origin (or is not finite); choose an origin within the map, or shift x and "
+            "y where the map itself states them"
         )
     if len(lane.centerline) < 2 or arclength(lane.centerline)[-1] < 0.01:
         raise TileError(f"{where}: lane {lane.lane_id} is shorter than 1 cm; repair the map")
+    if lane.speed_limit_mps < 0.0 or lane.speed_limit_mps > MAX_SPEED_LIMIT_MPS:  # False for NaN
+        raise TileError(
+            f"{where}: lane {lane.lane_id} has a speed limit of {lane.speed_limit_mps:g} m/s, "
+            f"expected 0 to {MAX_SPEED_LIMIT_MPS:g}; repair the map"
+        )
 
 
 def _starts(counts: Sequence[int]) -> NDArray[np.int32]:

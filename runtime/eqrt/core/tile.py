@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import TileError
-from eqrt.core.lanes import MAX_COORDINATE_M, NO_LANE, LaneMap, LaneType
+from eqrt.core.lanes import MAX_COORDINATE_M, MAX_SPEED_LIMIT_MPS, NO_LANE, LaneMap, LaneType
 
 MAGIC = b"EQRTTILE"
 VERSION = 1
@@ -95,7 +95,8 @@ def encode(lane_map: LaneMap, info: TileInfo) -> bytes:
     Raises TileError if the map is larger than a tile may be, or not one that `decode` would take.
     """
     texts = b"\0".join(
-        text.replace("\0", " ").encode() for text in (info.name, info.source, info.credit)
+        text.replace("\0", " ").encode(errors="replace")
+        for text in (info.name, info.source, info.credit)
     )
     counts = _Counts(len(lane_map.points), lane_map.num_lanes, len(lane_map.successor), len(texts))
     _check(lane_map, counts, info.name)
@@ -181,7 +182,8 @@ def _check(lane_map: LaneMap, counts: _Counts, where: str) -> None:
     """Raise TileError unless every index and value is in range."""
     lanes, speed = counts.lanes, lane_map.speed_limit_mps
     faults = {
-        "its size is beyond what a tile may be": not counts.sensible,
+        f"its size is beyond what a tile may be ({MAX_POINTS:,} points, {MAX_TEXT_BYTES:,} bytes "
+        "of text)": not counts.sensible,
         "lanes do not cover its points": not _splits(lane_map.lane_start, counts.points, 2),
         "successors are not in order": not _splits(lane_map.successor_start, counts.successors, 0),
         "a successor does not exist": not _within(lane_map.successor, 0, lanes),
@@ -190,7 +192,7 @@ def _check(lane_map: LaneMap, counts: _Counts, where: str) -> None:
         "a lane type is not known": not _within(lane_map.lane_type, 0, len(LaneType)),
         "lane ids come twice": len(np.unique(lane_map.lane_id)) != lanes,
         "points lie too far out": not (np.abs(lane_map.points) <= MAX_COORDINATE_M).all(),
-        "a speed limit is not sensible": bool(((speed < 0) | (speed > 1e3)).any()),
+        "a speed limit is not sensible": bool(((speed < 0) | (speed > MAX_SPEED_LIMIT_MPS)).any()),
     }
     for fault, found in faults.items():
         if found:

@@ -53,10 +53,10 @@ def read_city_map(path: Path) -> LaneMap:
         segments = [way.segment(nodes) for way in ways]
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error}); fetch it again") from error
-    except ElementTree.ParseError as error:
-        raise LogError(f"{path}: not XML ({error}); expected an Argoverse 1 map") from error
     except _MalformedError as error:
         raise LogError(f"{path}: {error}; expected an Argoverse 1 map") from error
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an unknown encoding
+        raise LogError(f"{path}: not XML ({error}); expected an Argoverse 1 map") from error
     return _lane_map(segments, path)
 
 

@@ -69,14 +69,16 @@ class Lanelet:
     adjacent_right: Adjacent | None
     speed_limit_mps: float
     """NaN = not known."""
-    lanelet_type: str
-    """CommonRoad's word (urban, highway, ...), empty in 2018b."""
+    lanelet_types: tuple[str, ...]
+    """CommonRoad's words (urban, highway, intersection, ...), none in 2018b."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
     """One recorded stretch of driving."""
 
+    path: Path
+    """The file that it was read from."""
     name: str
     """The benchmark id."""
     source: str
@@ -95,6 +97,7 @@ def read_scenario(path: Path) -> Scenario:
     try:
         limits = _sign_limits(root)
         scenario = Scenario(
+            path=path,
             name=root.get("benchmarkID", path.name.partition(".")[0]),
             source=root.get("source", ""),
             dt_s=_number(root.get("timeStepSize"), "timeStepSize"),
@@ -111,10 +114,10 @@ def read_scenario(path: Path) -> Scenario:
 
 
 def lane_map(scenario: Scenario) -> LaneMap:
-    """The scenario's lanelets as centerlines in its own frame.
+    """The scenario's lanelets for vehicles as centerlines in its own frame.
 
-    A successor that only the other lanelet states (as its predecessor) is added. Raises TileError
-    if a lanelet cannot be used.
+    A successor that only the other lanelet states (as its predecessor) is added. Raises TileError,
+    naming the file, if a lanelet cannot be used.
     """
     follows: dict[int, list[int]] = {lanelet.lanelet_id: [] for lanelet in scenario.lanelets}
     for lanelet in scenario.lanelets:
@@ -128,12 +131,13 @@ def lane_map(scenario: Scenario) -> LaneMap:
             successors=follows[lanelet.lanelet_id],
             left=_same_way(lanelet.adjacent_left),
             right=_same_way(lanelet.adjacent_right),
-            lane_type=_LANE_TYPES.get(lanelet.lanelet_type, LaneType.UNKNOWN),
+            lane_type=lane_type,
             speed_limit_mps=lanelet.speed_limit_mps,
         )
         for lanelet in scenario.lanelets
+        if (lane_type := _lane_type(lanelet)) not in _NOT_FOR_VEHICLES
     )
-    return build_lane_map(lanes, scenario.name)
+    return build_lane_map(lanes, str(scenario.path))
 
 
 _LANE_TYPES = {
@@ -149,6 +153,7 @@ _LANE_TYPES = {
     "crosswalk": LaneType.PEDESTRIAN,
     "busLane": LaneType.BUS,
 }
+_NOT_FOR_VEHICLES = {LaneType.BICYCLE, LaneType.PEDESTRIAN}
 _SPEED_SIGNS = {"R2-1", "274", "274.1"}  # maximum speed in the USA and in Germany; value in m/s
 
 
@@ -166,7 +171,7 @@ def _parse(path: Path) -> ElementTree.Element:
         raise LogError(f"{path}: no such scenario file") from error
     except (OSError, EOFError, zlib.error) as error:
         raise LogError(f"{path}: cannot be read ({error}); fetch or unpack it again") from error
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an unknown encoding
         raise LogError(f"{path}: not XML ({error}); expected a CommonRoad scenario") from error
     if root.tag != "commonRoad":
         raise LogError(f"{path}: the root is <{root.tag}>, expected a CommonRoad scenario")
@@ -222,7 +227,7 @@ def _lanelet(element: ElementTree.Element, limits: dict[str, float]) -> Lanelet:
         adjacent_left=_adjacent(element.find("adjacentLeft"), what),
         adjacent_right=_adjacent(element.find("adjacentRight"), what),
         speed_limit_mps=_speed_limit(element, limits, what),
-        lanelet_type=element.findtext("laneletType", ""),
+        lanelet_types=tuple(kind.text or "" for kind in element.iterfind("laneletType")),
     )
 
 
@@ -244,6 +249,13 @@ def _adjacent(element: ElementTree.Element | None, what: str) -> Adjacent | None
         lanelet_id=_identity(element.get("ref"), f"{what} {element.tag}"),
         same_direction=element.get("drivingDir") == "same",
     )
+
+
+def _lane_type(lanelet: Lanelet) -> LaneType:
+    """The first type that is for vehicles, else the first that is known."""
+    types = [_LANE_TYPES[word] for word in lanelet.lanelet_types if word in _LANE_TYPES]
+    types.sort(key=lambda lane_type: lane_type in _NOT_FOR_VEHICLES)
+    return types[0] if types else LaneType.UNKNOWN
 
 
 def _same_way(adjacent: Adjacent | None) -> int | None:

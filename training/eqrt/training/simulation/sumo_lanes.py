@@ -7,6 +7,7 @@ lane -> lane in the junction (two of them where a turn waits halfway) -> next la
 from __future__ import annotations
 
 import xml.sax
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,15 @@ Float64 = NDArray[np.float64]
 _ROADS = {"", "normal", "internal"}  # not crossings or footpaths
 _CARS = {"passenger", "private", "taxi", "delivery", "truck", "trailer", "motorcycle", "hov"}
 _BUSES = {"bus", "coach"}
+_NOT_READ = (
+    OSError,
+    EOFError,
+    zlib.error,
+    xml.sax.SAXException,
+    ValueError,
+    LookupError,  # also of an encoding that is not known
+    TypeError,
+)
 _SHORTEST_M = 0.02  # a lane map's lane is longer than 1 cm; shorter ones are passed through
 
 
@@ -77,7 +87,7 @@ def read_net(path: Path) -> SumoNet:
         }
         lanes = {name: lane for name, lane in drivable.items() if _length_m(lane) > _SHORTEST_M}
         follows = {name: list(_next(lane, drivable, lanes)) for name, lane in lanes.items()}
-    except (OSError, ValueError, KeyError, TypeError, xml.sax.SAXException) as error:
+    except _NOT_READ as error:
         raise LogError(f"{path}: not a SUMO network ({error}); give a *.net.xml file") from error
     if not lanes:
         raise TileError(f"{path}: no lanes for vehicles; give a SUMO network (*.net.xml) of roads")
