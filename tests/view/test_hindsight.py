@@ -164,6 +164,29 @@ def test_cycles_that_did_not_come_whole_are_counted() -> None:
     assert joiner.lost_cycles == 3
 
 
+def test_parts_of_different_cycles_make_no_cycle() -> None:
+    """Of two services at one address, or of one that started again within a cycle."""
+    here, there = ([part_of(p) for p in encode_datagrams(crowd(0, n))] for n in (200, 190))
+    other_model = [replace(one, forecasts=replace(one.forecasts, model_id="other")) for one in here]
+    joiner = Joiner()
+    last = len(here) - 1
+    for one in (here[0], here[0], *here[2:], *other_model[:last]):  # twice; without 1; no last one
+        assert joiner.add(one) is None
+    assert joiner.lost_cycles == 2
+    assert joiner.add(there[0]) is None
+    assert joiner.lost_cycles == 3
+    later = [joiner.add(one) for one in reversed(here)]  # in whatever order they come
+    assert later[:-1] == [None] * last
+    assert later[-1] is not None
+    np.testing.assert_array_equal(later[-1].track_id, crowd(0, 200).track_id)
+
+
+def part_of(payload: bytes) -> Datagram:
+    part = decode_datagram(payload)
+    assert isinstance(part, Datagram)
+    return part
+
+
 def test_the_last_minute_is_bounded_in_time_and_in_bytes() -> None:
     minute = LastMinute(kept_s=10.0, kept_bytes=5_000)
     for second in range(30):
