@@ -407,6 +407,24 @@ def test_a_velocity_that_is_not_known_can_be_told_from_standing(tmp_path: Path) 
         assert len(kinematics.predicted_paths) == 2  # planners take the best without looking
 
 
+def test_silence_is_stamped_with_when_it_was_said(tmp_path: Path) -> None:
+    """Not with the last measurement: then, there were objects. In Foxglove they go."""
+    car = one_car()
+    silent = replace(nobody(), cycle=301, made_s=car.made_s + 0.4)
+    before, after = objects_of(tmp_path, car, silent)
+    assert (len(before.objects), len(after.objects)) == (1, 0)
+    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in (before, after)]
+    assert stamps[1] - stamps[0] == pytest.approx(0.012, abs=0.01)  # recorded at once
+    convert(read_recordings(tmp_path)[0], "foxglove", tmp_path / "drive.mcap")
+    with (tmp_path / "drive.mcap").open("rb") as stream:
+        scenes = [
+            SceneUpdate.FromString(message.data)
+            for _, _, message in mcap.reader.make_reader(stream).iter_messages(topics=["/scene"])
+        ]
+    shown, gone = scenes[0].entities[0].timestamp, scenes[1].deletions[0].timestamp
+    assert gone.ToNanoseconds() > shown.ToNanoseconds()
+
+
 def test_without_a_map_pose_no_object_is_in_autowares_map(tmp_path: Path) -> None:
     messages = objects_of(tmp_path, one_car(), replace(one_car(), mode=Mode.NO_POSE))
     assert [message.header.frame_id for message in messages] == ["map", "odom"]

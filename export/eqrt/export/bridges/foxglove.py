@@ -100,7 +100,7 @@ def write_foxglove(recordings: Iterable[Recording], out: IO[bytes]) -> int:
 
 
 def _put_cycle(put: Any, moment: Moment, forecasts: ForecastSet) -> None:
-    measured = _timestamp(moment.wall_ns(forecasts.timestamp_s))
+    measured = _timestamp(moment.wall_ns(forecasts.moment_s))
     put("/cycle", msgspec.json.encode(_cycle(forecasts)))
     pose = ego_pose(forecasts)
     if pose is not None:

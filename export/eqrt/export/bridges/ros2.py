@@ -103,7 +103,7 @@ class _Objects:
 
     def message(self, moment: Moment, forecasts: ForecastSet, run: str) -> Any:
         """One cycle."""
-        wall_ns = moment.wall_ns(forecasts.timestamp_s)
+        wall_ns = moment.wall_ns(forecasts.moment_s)
         stamp = self._new("builtin_interfaces/Time", wall_ns // 10**9, wall_ns % 10**9)
         facing, size = course_rad(forecasts), sizes(forecasts)
         return self._new(
