@@ -30,7 +30,9 @@ from recorded_drives import recorded_drive
 
 def update_of(forecast: ForecastSet) -> bytes:
     ghosts = Hindsight().add(forecast)
-    return encode_update(forecast, ghosts=ghosts, score=None, stream=0, mode_since_s=0.0)
+    return encode_update(
+        forecast, ghosts=ghosts, score=None, stream=0, time_s=forecast.moment_s, mode_since_s=0.0
+    )
 
 
 def test_places_come_back_to_a_centimetre() -> None:
@@ -92,7 +94,7 @@ def test_what_only_seems_to_stand_is_not_said_to_be_predicted() -> None:
         assert agents["words"] == ["not predicted: nothing tells how it moves"]
         assert agents["speed_mps"] == [None]
     agents = decode_update(update_of(one_car()))[0]["agents"]
-    assert agents["words"] == ["from a short history"]
+    assert agents["words"] == ["predicted from a short history"]
 
 
 def test_an_ellipse_holds_half_of_the_distribution() -> None:
@@ -130,9 +132,10 @@ def test_lanes_are_told_around_the_ego_vehicle_and_again_when_it_has_driven_on()
 
     def there(ahead_m: float) -> ForecastSet:
         pose = Pose2(x_m + ahead_m, y_m, 0.0)
-        return replace(one_car(), tile_id="e66f7853", mode=Mode.RUN, map_from_ego=pose)
+        tile_id = "e66f7853" if ahead_m else ""
+        return replace(one_car(), tile_id=tile_id, mode=Mode.RUN, map_from_ego=pose)
 
-    first = lanes.near(there(0.0))
+    first = lanes.near(there(0.0).targets(slice(0)))  # on an empty road no lanes are looked for
     assert first is not None
     told = json.loads(first)
     points = np.array(told["lanes"][0]).reshape(-1, 2) / 100.0 + told["origin"]
@@ -159,11 +162,37 @@ def test_the_map_is_the_one_that_the_service_says(tmp_path: Path) -> None:
     assert lanes.hear(status_with(TILE, tile.info.tile_id)) == ""
     assert lanes.near(there) is not None
     assert len(lanes.recent) == 1
+    assert lanes.taken_back() is None
     assert lanes.hear(status_with(TILE, "0ddba12"))
     assert not lanes.recent  # of the map before
 
 
-def status_with(tile: Path, tile_id: str) -> ServiceStatus:
+def test_lanes_of_a_map_that_is_used_no_more_are_taken_back(tmp_path: Path) -> None:
+    """Whether the service was given none, or one that the view cannot read; and what was wrong is
+    said until it is right again."""
+    tile = load_tile(TILE)
+    x_m, y_m = tile.lane_map.lane_points(0)[0].tolist()
+    place = Pose2(x_m, y_m, 0.0)
+    there = replace(one_car(), tile_id=tile.info.tile_id, mode=Mode.RUN, map_from_ego=place)
+    lanes = Lanes()
+    for path, tile_id in ((None, ""), (tmp_path / "gone.tile", "0badc0de")):
+        assert lanes.hear(status_with(TILE, tile.info.tile_id)) == ""
+        told = lanes.near(there)
+        assert told is not None
+        for _ in range(2):
+            said = lanes.hear(status_with(path, tile_id))
+            assert said.startswith("no lanes are shown: ") == (path is not None)
+        taken_back = lanes.taken_back()
+        assert taken_back is not None
+        none = json.loads(taken_back)
+        assert none["lanes"] == []
+        assert none["tile"] != json.loads(told)["tile"]
+        assert none["number"] == json.loads(told)["number"] + 1
+        assert lanes.taken_back() is None
+        assert lanes.near(there) is None
+
+
+def status_with(tile: Path | None, tile_id: str) -> ServiceStatus:
     return ServiceStatus(
         time_s=1.0,
         uptime_s=1.0,
@@ -172,7 +201,7 @@ def status_with(tile: Path, tile_id: str) -> ServiceStatus:
         profile="generic",
         model="m",
         model_id="",
-        tile=str(tile),
+        tile=str(tile or ""),
         tile_id=tile_id,
         mode=Mode.RUN,
         mode_s=1.0,

@@ -63,14 +63,16 @@ class Live:
         if (lanes := self._lanes.near(forecast)) is not None:
             server.tell("lanes", lanes)
         update = self._watch.update(forecast)
-        self._minute.add(forecast.timestamp_s, update)
+        self._minute.add(self._watch.time_s, update)
         server.show(update)
 
     def _take_status(self, status: ServiceStatus, server: ViewServer) -> None:
         text = encode_status(status, lost_cycles=self._ear.lost_cycles)
         self._statuses.append(msgspec.Raw(text.encode()))
         server.tell("status", text)
-        self._lanes_trouble = self._lanes.hear(status) or self._lanes_trouble
+        self._lanes_trouble = self._lanes.hear(status)
+        if (none := self._lanes.taken_back()) is not None:
+            server.tell("lanes", none)
 
     def _say(self, server: ViewServer) -> None:
         """What is wrong now, when it has changed."""

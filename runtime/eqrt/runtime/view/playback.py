@@ -32,7 +32,7 @@ class Playback:
         self, records: Iterable[ForecastSet | ServiceStatus], name: str, tile: Path | None
     ) -> None:
         self._records, self._name = records, name
-        self._watch = Watch()
+        self._watch = Watch(joins_runs=True)
         self._lanes = Lanes(tile)
         self._store = _Store()
         self._times_s: list[float] = []
@@ -103,13 +103,16 @@ class Playback:
     def _take(self, record: ForecastSet | ServiceStatus) -> None:
         if isinstance(record, ServiceStatus):
             self.trouble = self._lanes.hear(record) or self.trouble
-            self._statuses.append(msgspec.Raw(encode_status(record, lost_cycles=0).encode()))
+            if (none := self._lanes.taken_back()) is not None:
+                self._lanes_from.append((len(self._times_s), none))
+            text = encode_status(record, lost_cycles=0, shift_s=self._watch.shift_s)
+            self._statuses.append(msgspec.Raw(text.encode()))
             return
         if (lanes := self._lanes.near(record)) is not None:
             self._lanes_from.append((len(self._times_s), lanes))
         update = self._watch.update(record)
         self._store.append(update)
-        self._times_s.append(record.timestamp_s)  # last: from now on it may be asked for
+        self._times_s.append(self._watch.time_s)  # last: from now on it may be asked for
 
 
 class _Store:

@@ -208,7 +208,7 @@ def _head(state: State, now_s: float) -> list[Text]:
         ]
     mark, style = _MARKS[LEVELS[state.cycle.mode]]
     words = mode_words(state.cycle.mode, state.cycle.num_targets)
-    for_s = state.cycle.timestamp_s - state.watch.mode_since_s
+    for_s = state.watch.time_s - state.watch.mode_since_s
     if LEVELS[state.cycle.mode] != GOOD and not state.paused:
         words += f", for {for_s:.0f} s"
     if not state.paused and now_s - state.heard_s > _SILENT_S:

@@ -102,16 +102,17 @@ def encode_update(
     ghosts: Ghosts,
     score: Score | None,
     stream: int,
+    time_s: float,
     mode_since_s: float,
 ) -> bytes:
-    """One cycle. Places: position (A, 2), history (A, T, 2), ghosts (A, 3, 2), trajectories
-    (A, K, H, 2).
+    """One cycle, and when it is to be shown. Places: position (A, 2), history (A, T, 2), ghosts
+    (A, 3, 2), trajectories (A, K, H, 2).
     """
     origin = _origin(forecast)
     head = Head(
         stream=stream,
         cycle=forecast.cycle,
-        time_s=forecast.timestamp_s,
+        time_s=time_s,
         made_s=forecast.made_s,
         compute_s=forecast.compute_s,
         mode=forecast.mode.name,
@@ -140,11 +141,11 @@ def encode_update(
     )
 
 
-def encode_status(status: ServiceStatus, *, lost_cycles: int) -> str:
-    """The service's own word, for the panels."""
+def encode_status(status: ServiceStatus, *, lost_cycles: int, shift_s: float = 0.0) -> str:
+    """The service's own word, for the panels; `shift_s`: from its clock to that of the cycles."""
     return _text(
         "status",
-        time_s=status.time_s,
+        time_s=status.time_s + shift_s,
         seconds=status.seconds,
         uptime_s=status.uptime_s,
         eqrt=status.eqrt,
@@ -224,7 +225,9 @@ def decode_update(payload: bytes) -> tuple[dict[str, Any], dict[str, Float64]]:
 
 
 def is_on_map(forecast: ForecastSet) -> bool:
-    """Whether the cycle was predicted with a tile, in its frame."""
+    """Whether the map frame is known to be that of a tile."""
+    if forecast.mode is Mode.RUN:  # also on an empty road, which no lanes were asked for
+        return True
     return bool(forecast.tile_id) and forecast.mode is not Mode.NO_POSE
 
 
