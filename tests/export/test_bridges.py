@@ -449,6 +449,21 @@ def test_a_bag_is_not_written_over(
     assert "a new folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("out", ["-", "out.jsonl"])
+def test_what_is_missing_of_a_recording_is_said(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    """Also where its predictions go to standard output, and not among them."""
+    torn = tmp_path / recording.paths[0].name
+    torn.write_bytes(recording.paths[0].read_bytes()[:-1000])
+    file = out if out == "-" else str(tmp_path / out)
+    assert main(["convert", str(torn), "--to", "jsonl", "--out", file]) == 0
+    told = capsys.readouterr()
+    assert told.err.count("\n") == 1
+    assert "read up to there" in told.err
+    assert "read up to there" not in told.out
+
+
 # --- text
 
 
