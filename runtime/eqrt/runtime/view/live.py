@@ -62,7 +62,7 @@ class Live:
     def _take_cycle(self, forecast: ForecastSet, server: ViewServer) -> None:
         if (lanes := self._lanes.near(forecast)) is not None:
             server.tell("lanes", lanes)
-        update = self._watch.update(forecast)
+        update = self._watch.update(forecast, lanes=self._lanes.number)
         self._minute.add(self._watch.time_s, update)
         server.show(update)
 
@@ -71,8 +71,6 @@ class Live:
         self._statuses.append(msgspec.Raw(text.encode()))
         server.tell("status", text)
         self._lanes_trouble = self._lanes.hear(status)
-        if (none := self._lanes.taken_back()) is not None:
-            server.tell("lanes", none)
 
     def _say(self, server: ViewServer) -> None:
         """What is wrong now, when it has changed."""

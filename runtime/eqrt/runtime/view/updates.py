@@ -84,6 +84,8 @@ class Head(msgspec.Struct, kw_only=True):
     level: str
     on_map: bool
     """Whether the map frame is that of the tile, so that lanes may be drawn."""
+    lanes: int
+    """Number of the message with the lanes around here; -1 = there is none."""
     ego: tuple[float, float, float] | None
     """x, y in m, yaw in rad, map frame; None = not known."""
     ego_speed_mps: float | None
@@ -104,6 +106,7 @@ def encode_update(
     stream: int,
     time_s: float,
     mode_since_s: float,
+    lanes: int,
 ) -> bytes:
     """One cycle, and when it is to be shown. Places: position (A, 2), history (A, T, 2), ghosts
     (A, 3, 2), trajectories (A, K, H, 2).
@@ -120,6 +123,7 @@ def encode_update(
         mode_since_s=mode_since_s,
         level=LEVELS[forecast.mode],
         on_map=is_on_map(forecast),
+        lanes=lanes,
         ego=ego_pose(forecast),
         ego_speed_mps=_known(forecast.ego_speed_mps),
         origin=origin,

@@ -10,12 +10,11 @@ from pathlib import Path
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.prediction.tiles import Tile, load_tile
 from eqrt.runtime.view.hindsight import Ghosts, Hindsight, Score
 from eqrt.runtime.view.updates import (
     ego_pose,
     encode_lanes,
-    encode_text,
     encode_update,
     is_on_map,
 )
@@ -27,6 +26,7 @@ LANES_M = 500.0
 _LANES_STEP_M = 200.0  # how far it drives before it gets others
 BETWEEN_RUNS_S = 1.0
 """In a file, from the end of one run of the service to the beginning of the next."""
+NO_LANES = -1
 _LEAST_STEP_S = 0.01  # between two cycles as pages are told; those of a service are farther apart
 LANES_KEPT = 10
 """As many as the page keeps (`scene.mjs`): a minute at 120 km/h."""
@@ -64,8 +64,8 @@ class Watch:
         self._last = forecast
         return self._hindsight.add(forecast), self._hindsight.score()
 
-    def update(self, forecast: ForecastSet) -> bytes:
-        """The same, as a page is told."""
+    def update(self, forecast: ForecastSet, *, lanes: int = NO_LANES) -> bytes:
+        """The same, as a page is told; `lanes`: the number of those around it."""
         ghosts, score = self.add(forecast)
         return encode_update(
             forecast,
@@ -74,6 +74,7 @@ class Watch:
             stream=self.stream,
             time_s=self.time_s,
             mode_since_s=self.mode_since_s,
+            lanes=lanes,
         )
 
     def _begin_again(self, forecast: ForecastSet) -> None:
@@ -129,10 +130,10 @@ class Lanes:
         self._is_fixed = tile is not None
         self._heard = ""
         self._trouble = ""
-        self._outdated = False
         self._centre: tuple[float, float] | None = None
-        self.number = -1
-        """Of the newest message."""
+        self._told = 0
+        self.number = NO_LANES
+        """Of the message with the lanes around the newest cycle, counted from 0."""
         self.recent: deque[str] = deque(maxlen=LANES_KEPT)
         """Of the last minute's ways, the newest last, for whoever joins."""
 
@@ -140,29 +141,29 @@ class Lanes:
         """Take the map that the service says it uses; returns what is wrong with it, or ""."""
         if self._is_fixed or status.tile_id == self._heard:
             return self._trouble
-        self._heard, self._trouble = status.tile_id, ""
-        self._tile = self._centre = None
-        self._outdated = bool(self.recent)
-        self.recent.clear()
+        self._trouble = ""
+        self._take(None, status.tile_id)
         if not status.tile:
             return ""
         try:
-            self._tile = load_tile(Path(status.tile))
+            tile = load_tile(Path(status.tile))
         except EqrtError as error:
             self._trouble = f"no lanes are shown: {error}"
             return self._trouble
-        if self._tile.info.tile_id != status.tile_id:
+        self._take(tile, status.tile_id)
+        if tile.info.tile_id != status.tile_id:
             changed = f"{status.tile} has changed since the service read it"
             self._trouble = f"{changed}: its lanes may differ"
         return self._trouble
 
-    def taken_back(self) -> str | None:
-        """What to tell, if the lanes that were told are those of another map."""
-        if not self._outdated:
-            return None
-        self._outdated = False
-        self.number += 1
-        return encode_text("lanes", number=self.number, origin=(0.0, 0.0), lanes=[], tile="")
+    def use(self, tile: Tile | None) -> None:
+        """Take the map that a recording has with it."""
+        if not self._is_fixed:
+            self._take(tile, tile.info.tile_id if tile else "")
+
+    def _take(self, tile: Tile | None, tile_id: str) -> None:
+        self._tile, self._heard = tile, tile_id
+        self._centre, self.number = None, NO_LANES
 
     def near(self, forecast: ForecastSet) -> str | None:
         """What to tell, if it is something new."""
@@ -174,7 +175,7 @@ class Lanes:
         ):
             return None
         self._centre = position
-        self.number += 1
+        self.number, self._told = self._told, self._told + 1
         told = encode_lanes(self._tile, centre=position, radius_m=LANES_M, number=self.number)
         self.recent.append(told)
         return told

@@ -12,7 +12,7 @@ const SIZES = { // metres, where the sensor tells none: drawn dashed
 const DOT_M = 1; // radius of an object of which neither size nor class is known
 const EGO_M = [4.6, 1.9];
 const LEAST_PX = 5; // nobody is drawn smaller
-const LANES_KEPT = 10; // a minute at 120 km/h
+const LANES_KEPT = 30; // as far as 150 s at 120 km/h: of a file, so much is at hand
 const TURNED_BACK = Math.PI;
 
 /** Draws moments on a canvas. */
@@ -44,17 +44,16 @@ export class Scene {
     camera.resize(clientWidth, clientHeight);
   }
 
-  /** Takes the lanes around another place; those of another map are gone. */
+  /** Takes the lanes around another place, of this map or another one. */
   addLanes(lanes) {
-    const others = this.laneSets.filter(({ tile, number }) => tile === lanes.tile && number !== lanes.number);
+    const others = this.laneSets.filter(({ number }) => number !== lanes.number);
     this.laneSets = [...others, lanes].slice(-LANES_KEPT);
   }
 
   /** The lanes around where a cycle was, or null. */
   lanesAt(cycle) {
     if (!cycle.on_map) return null;
-    const away = ({ origin }) => Math.hypot(origin[0] - cycle.origin[0], origin[1] - cycle.origin[1]);
-    return this.laneSets.reduce((best, one) => (!best || away(one) <= away(best) ? one : best), null);
+    return this.laneSets.find(({ number }) => number === cycle.lanes) ?? null;
   }
 
   /** Draws one moment; `selected` is a track id or null. `past(s)` is the cycle s seconds before. */
