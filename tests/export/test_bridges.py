@@ -29,6 +29,7 @@ from eqrt.export.bridges.ros2 import PREDICTED_OBJECTS, TOPIC, autoware_types, m
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.bus.candump import candump_line, candump_message
 from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
@@ -405,6 +406,28 @@ def test_a_velocity_that_is_not_known_can_be_told_from_standing(tmp_path: Path) 
         accel = kinematics.initial_acceleration_with_covariance.covariance.reshape(6, 6)
         np.testing.assert_array_equal(accel, 10_000.0 * np.eye(6))
         assert len(kinematics.predicted_paths) == 2  # planners take the best without looking
+
+
+@pytest.mark.parametrize(
+    ("kind", "label"),
+    [
+        (ObjectClass.UNKNOWN, 0),
+        (ObjectClass.CAR, 1),
+        (ObjectClass.TRUCK, 2),
+        (ObjectClass.MOTORCYCLE, 5),
+        (ObjectClass.BICYCLE, 6),
+        (ObjectClass.PEDESTRIAN, 7),
+        (ObjectClass.ANIMAL, 8),
+        (ObjectClass.STATIC, 0),
+        (99, 0),
+    ],
+)
+def test_classes_are_autowares(tmp_path: Path, kind: int, label: int) -> None:
+    """Also one that this version does not know."""
+    car = replace(one_car(), object_class=np.array([kind], np.uint8))
+    (message,) = objects_of(tmp_path, car)
+    (said,) = message.objects[0].classification
+    assert (said.label, said.probability) == (label, 1.0)
 
 
 def test_silence_is_stamped_with_when_it_was_said(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.prediction.tiles import load_tile
 from processes import PATIENCE_S, Heard, Serving
+from recorded_drives import recorded_drive
 from viewing import Viewing, artifact, watched
 
 TILE_ID = load_tile(TILE).info.tile_id
@@ -464,6 +465,28 @@ def test_a_file_of_several_starts_plays_through(browser: Browser, tmp_path: Path
         wait(browser, "e.selected !== null && e.moment.cycle > 20")
         wait(browser, "e.moment.time_s > 904.5 && e.moment.cycle < 20 && e.selected === null")
         wait(browser, "e.paused && e.moment.cycle === 29")
+
+
+def test_a_folder_of_drives_is_shown_with_what_ran_in_each(
+    browser: Browser, tmp_path: Path
+) -> None:
+    """Real ones, with a map and without; the second was killed."""
+    folder = tmp_path / "drives"
+    for name in ("ngsim", "rav4"):
+        with recorded_drive(name, folder, tmp_path / f"{name}.log", until=25) as (service, _):
+            service.end(signal.SIGTERM if name == "ngsim" else signal.SIGKILL)
+    what = "document.getElementById('what').innerText"
+    with Viewing(str(folder)) as viewing:
+        browser.open(viewing.address)
+        wait(browser, "e.lanes > 0 && e.agents.length > 10")
+        wait(browser, f"/profile generic.* map ngsim.tile/.test({what})")
+        browser.screenshot(artifact("view-folder.png"))
+        wait(browser, f"/toyota-rav4.* no map/.test({what})")
+        wait(browser, "e.paused && e.lanes === 0 && e.agents.length > 2")
+        browser.press(*["ArrowLeft"] * 40)
+        wait(browser, "e.lanes > 0")
+        wait(browser, f"/profile generic/.test({what})")
+        assert browser.console() == []
 
 
 def test_where_a_file_has_nothing_it_says_so(browser: Browser, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ _DEFINITIONS = {
     ),
     "PredictedObjects": "std_msgs/Header header\nPredictedObject[] objects",
 }
-_LABELS = {  # Autoware's numbers
+_LABELS: dict[int, int] = {  # Autoware's numbers
     ObjectClass.UNKNOWN: 0,
     ObjectClass.CAR: 1,
     ObjectClass.TRUCK: 2,
@@ -118,7 +118,7 @@ class _Objects:
     def _object(
         self, forecasts: ForecastSet, row: int, course_rad: float, size: list[float], run: str
     ) -> Any:
-        label = _LABELS[ObjectClass(int(forecasts.object_class[row]))]
+        label = _LABELS.get(int(forecasts.object_class[row]), 0)  # of a newer eqrt: not known
         uuid = bytes.fromhex(run) + bytes(4) + int(forecasts.track_id[row]).to_bytes(8, "big")
         dimensions = self._new("geometry_msgs/Vector3", *size, HEIGHT_M)
         footprint = self._new("geometry_msgs/Polygon", [])

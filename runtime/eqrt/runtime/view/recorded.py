@@ -20,7 +20,7 @@ from eqrt.runtime.output.json_lines import Line
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.recording.folder import SUFFIX
-from eqrt.runtime.recording.reader import Exchanged, read_recordings
+from eqrt.runtime.recording.reader import Exchanged, Recording, read_recordings
 from eqrt.runtime.recording.replaying import recorded_tile
 from eqrt.runtime.recording.topics import Topic
 
@@ -61,8 +61,15 @@ def read_records(path: Path) -> Records:
 
 
 def read_recording(path: Path) -> Records:
-    """Cycles and status from what `eqrt serve --record` wrote: a file, or a folder of them."""
-    for recording in read_recordings(path):
+    """Cycles and status from what `eqrt serve --record` wrote: a file, or a folder of them.
+
+    Raises LogError at once if there is none.
+    """
+    return _records(read_recordings(path))
+
+
+def _records(recordings: list[Recording]) -> Records:
+    for recording in recordings:
         yield TileUsed(recorded_tile(recording, recording.attached))
         for recorded in recording.entries(frozenset({Topic.FORECASTS, Topic.STATUS})):
             if isinstance(recorded.entry, Exchanged):

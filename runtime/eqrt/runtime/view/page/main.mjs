@@ -171,7 +171,7 @@ function panels() {
   const stopped = page.lost || (timeline.mode === "live" && silent > STALE_S);
   page.words = showBanner({
     lost: page.lost, hello: page.hello, moment, silent,
-    status: page.statuses.at(-1), waiting: now - page.opened,
+    status: statusAt(moment?.time), waiting: now - page.opened,
   });
   showService(page.statuses, moment, timeline.mode, page.trouble ? [page.trouble] : [], scene.colours);
   showScore(moment?.cycle.score ?? null);
@@ -179,6 +179,14 @@ function panels() {
   showTransport(timeline, stopped ? now - timeline.arrived : 0);
   sayTurn();
   sayFollow();
+}
+
+/** What the service said of the second of a moment, else before it, else first. */
+function statusAt(time = Infinity) {
+  const after = page.statuses.findIndex((status) => status.time_s >= time);
+  if (after < 0) return page.statuses.at(-1);
+  const { time_s: said, seconds: period } = page.statuses[after];
+  return said - period <= time ? page.statuses[after] : page.statuses[Math.max(0, after - 1)];
 }
 
 /** For how long nothing has come that should, or stands in a file, s. */
