@@ -23,7 +23,13 @@ _OPTIONS = (
     "--disable-gpu",
 )
 
-KEYS = {"Escape": "\ue00c", "ArrowLeft": "\ue012", "ArrowRight": "\ue014", "Tab": "\ue004"}
+KEYS = {
+    "Escape": "\ue00c",
+    "ArrowLeft": "\ue012",
+    "ArrowRight": "\ue014",
+    "Tab": "\ue004",
+    "Enter": "\ue007",
+}
 """How WebDriver writes keys that are no letters."""
 
 

@@ -29,6 +29,7 @@ from eqrt.export.bridges.ros2 import PREDICTED_OBJECTS, TOPIC, autoware_types, m
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.bus.candump import candump_line, candump_message
 from eqrt.runtime.bus.health import BusHealth
+from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
@@ -169,20 +170,90 @@ def test_foxglove_knows_where_the_ego_vehicle_is(
     assert math.cos(yaw_rad - last.map_from_ego.yaw_rad) == pytest.approx(1.0)
 
 
+def recording_of(folder: Path, *cycles: ForecastSet) -> Recording:
+    """What a service would have recorded that said this."""
+    pipeline = Pipeline(load_profile("generic"), shipped_predictor())
+    with Recorder(order_of(folder, pipeline), TapedClock(lambda: 0.0), RunTape()) as recorder:
+        for forecasts in cycles:
+            recorder.publish(forecasts)
+    (recording,) = read_recordings(folder)
+    return recording
+
+
 def test_foxglove_is_told_no_place_of_an_ego_vehicle_whose_place_is_not_known(
     tmp_path: Path,
 ) -> None:
-    pipeline = Pipeline(load_profile("generic"), shipped_predictor())
-    with Recorder(order_of(tmp_path, pipeline), TapedClock(lambda: 0.0), RunTape()) as recorder:
-        recorder.publish(one_car())
-        recorder.publish(replace(nobody(), map_from_ego=None, ego_speed_mps=math.nan))
-    (recording,) = read_recordings(tmp_path)
+    nowhere = replace(nobody(), map_from_ego=None, ego_speed_mps=math.nan)
+    recording = recording_of(tmp_path, one_car(), nowhere)
     found = shown_of(recording, tmp_path / "drive.mcap")
     known, unknown = (json.loads(content) for _, content in found["/cycle"])
     ego = ("ego_x", "ego_y", "ego_yaw", "ego_speed")
     assert [known[name] for name in ego] == pytest.approx([100.0, 200.0, math.pi / 2, 8.0])
     assert [unknown[name] for name in ego] == [None] * 4
     assert len(found["/tf"]) == 1
+
+
+def test_without_a_map_pose_foxglove_shows_nobody_in_the_map(tmp_path: Path) -> None:
+    """The places are those of the ego vehicle's own dead reckoning."""
+    found = shown_of(
+        recording_of(tmp_path, one_car(), replace(one_car(), mode=Mode.NO_POSE)),
+        tmp_path / "drive.mcap",
+    )
+    frames = [
+        (SceneUpdate.FromString(scene).entities[0].frame_id, FrameTransform.FromString(tf))
+        for (_, scene), (_, tf) in zip(found["/scene"], found["/tf"], strict=True)
+    ]
+    assert [(frame, tf.parent_frame_id) for frame, tf in frames] == [("map", "map"), ("odom",) * 2]
+    assert {tf.child_frame_id for _, tf in frames} == {"ego"}
+
+
+def test_who_is_predicted_no_more_leaves_foxgloves_scene_at_once(tmp_path: Path) -> None:
+    later = replace(nobody(), timestamp_s=1000.3, made_s=1000.312)
+    found = shown_of(recording_of(tmp_path, one_car(), later), tmp_path / "drive.mcap")
+    before, after = (SceneUpdate.FromString(content) for _, content in found["/scene"])
+    assert (len(before.entities), len(after.entities)) == (1, 0)
+    (deletion,) = after.deletions
+    assert deletion.type == deletion.ALL
+    assert deletion.timestamp.ToNanoseconds() > before.entities[0].timestamp.ToNanoseconds()
+
+
+def test_a_box_in_foxglove_looks_where_its_target_does_or_is_none(tmp_path: Path) -> None:
+    """A wandering reflection has a velocity, but no direction."""
+    car = one_car()
+    wandering = replace(car, heading_rad=np.array([np.nan]), velocity=np.array([[0.1, -0.2]]))
+    found = shown_of(recording_of(tmp_path, car, wandering), tmp_path / "drive.mcap")
+    scenes = [SceneUpdate.FromString(content).entities[0] for _, content in found["/scene"]]
+    assert [(len(one.cubes), len(one.cylinders)) for one in scenes] == [(1, 0), (0, 1)]
+    turned = scenes[0].cubes[0].pose.orientation
+    assert 2.0 * math.atan2(turned.z, turned.w) == pytest.approx(math.pi / 2)
+    assert scenes[1].cylinders[0].pose.position.y == 220.0
+
+
+def test_foxglove_has_the_lanes_of_the_tile_that_predicts(tmp_path: Path) -> None:
+    """A tile that was exchanged for none under way."""
+    assert NGSIM.tile is not None
+    on_tile = Pipeline(load_profile("generic"), shipped_predictor(), load_tile(NGSIM.tile))
+    order = order_of(tmp_path, on_tile)
+    without = order_of(tmp_path, Pipeline(load_profile("generic"), shipped_predictor()))
+    with Recorder(order, TapedClock(lambda: 0.0), RunTape()) as recorder:
+        recorder.publish(one_car())
+        recorder.describe(without.description)
+        recorder.publish(replace(one_car(), cycle=301))
+    (recording,) = read_recordings(tmp_path)
+    convert_all(recording, tmp_path / "drive.mcap")
+    with (tmp_path / "drive.mcap").open("rb") as stream:
+        updates = [
+            SceneUpdate.FromString(message.data)
+            for _, _, message in mcap.reader.make_reader(stream).iter_messages(topics=["/lanes"])
+        ]
+    assert [len(update.entities) for update in updates] == [1, 0]
+    assert updates[1].deletions[0].type == updates[1].deletions[0].ALL
+
+
+def convert_all(recording: Recording, out: Path) -> None:
+    """All files of a run."""
+    folder = str(recording.paths[0].parent)
+    assert main(["convert", folder, "--to", "foxglove", "--out", str(out)]) == 0
 
 
 def test_foxglove_has_lanes_numbers_and_a_log(
@@ -298,6 +369,90 @@ def test_a_bag_has_autowares_predicted_objects(recording: Recording, tmp_path: P
             np.testing.assert_allclose(path, expected)
 
 
+def objects_of(folder: Path, *cycles: ForecastSet) -> list[Any]:
+    """The messages of a bag."""
+    convert(recording_of(folder, *cycles), "rosbag2", folder / "bag")
+    with AnyReader([folder / "bag"], default_typestore=autoware_types()) as reader:
+        return [reader.deserialize(raw, of.msgtype) for of, _, raw in reader.messages()]
+
+
+def yaw_of(pose: Any) -> float:
+    return 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
+
+
+def test_a_velocity_is_told_in_the_objects_own_frame(tmp_path: Path) -> None:
+    """A car that looks north slides north-east: ahead, and to the right."""
+    (message,) = objects_of(tmp_path, replace(one_car(), velocity=np.array([[3.0, 4.0]])))
+    kinematics = message.objects[0].kinematics
+    assert yaw_of(kinematics.initial_pose_with_covariance.pose) == pytest.approx(math.pi / 2)
+    twist = kinematics.initial_twist_with_covariance
+    assert (twist.twist.linear.x, twist.twist.linear.y) == pytest.approx((4.0, -3.0))
+    assert not twist.covariance.any()  # zeros: not known
+    assert not kinematics.initial_pose_with_covariance.covariance.any()
+
+
+def test_a_velocity_that_is_not_known_can_be_told_from_standing(tmp_path: Path) -> None:
+    """Both are 0, and only one of them is said to be measured; so are headings."""
+    stands = replace(one_car(), velocity=np.zeros((1, 2)))
+    unknown = replace(one_car(), velocity=np.full((1, 2), np.nan), heading_rad=np.array([np.nan]))
+    told = [one.objects[0].kinematics for one in objects_of(tmp_path, stands, unknown)]
+    twists = [kinematics.initial_twist_with_covariance for kinematics in told]
+    assert [(t.twist.linear.x, t.twist.linear.y) for t in twists] == [(0.0, 0.0)] * 2
+    diagonals = [t.covariance.reshape(6, 6).diagonal() for t in twists]
+    np.testing.assert_array_equal(diagonals, [[0.0] * 6, [10_000.0] * 6])
+    yaws = [k.initial_pose_with_covariance.covariance[35] for k in told]
+    assert yaws == [0.0, 10_000.0]
+    for kinematics in told:  # which nobody measures
+        accel = kinematics.initial_acceleration_with_covariance.covariance.reshape(6, 6)
+        np.testing.assert_array_equal(accel, 10_000.0 * np.eye(6))
+        assert len(kinematics.predicted_paths) == 2  # planners take the best without looking
+
+
+@pytest.mark.parametrize(
+    ("kind", "label"),
+    [
+        (ObjectClass.UNKNOWN, 0),
+        (ObjectClass.CAR, 1),
+        (ObjectClass.TRUCK, 2),
+        (ObjectClass.MOTORCYCLE, 5),
+        (ObjectClass.BICYCLE, 6),
+        (ObjectClass.PEDESTRIAN, 7),
+        (ObjectClass.ANIMAL, 8),
+        (ObjectClass.STATIC, 0),
+        (99, 0),
+    ],
+)
+def test_classes_are_autowares(tmp_path: Path, kind: int, label: int) -> None:
+    """Also one that this version does not know."""
+    car = replace(one_car(), object_class=np.array([kind], np.uint8))
+    (message,) = objects_of(tmp_path, car)
+    (said,) = message.objects[0].classification
+    assert (said.label, said.probability) == (label, 1.0)
+
+
+def test_silence_is_stamped_with_when_it_was_said(tmp_path: Path) -> None:
+    """Not with the last measurement: then, there were objects. In Foxglove they go."""
+    car = one_car()
+    silent = replace(nobody(), cycle=301, made_s=car.made_s + 0.4)
+    before, after = objects_of(tmp_path, car, silent)
+    assert (len(before.objects), len(after.objects)) == (1, 0)
+    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in (before, after)]
+    assert stamps[1] - stamps[0] == pytest.approx(0.012, abs=0.01)  # recorded at once
+    convert(read_recordings(tmp_path)[0], "foxglove", tmp_path / "drive.mcap")
+    with (tmp_path / "drive.mcap").open("rb") as stream:
+        scenes = [
+            SceneUpdate.FromString(message.data)
+            for _, _, message in mcap.reader.make_reader(stream).iter_messages(topics=["/scene"])
+        ]
+    shown, gone = scenes[0].entities[0].timestamp, scenes[1].deletions[0].timestamp
+    assert gone.ToNanoseconds() > shown.ToNanoseconds()
+
+
+def test_without_a_map_pose_no_object_is_in_autowares_map(tmp_path: Path) -> None:
+    messages = objects_of(tmp_path, one_car(), replace(one_car(), mode=Mode.NO_POSE))
+    assert [message.header.frame_id for message in messages] == ["map", "odom"]
+
+
 def test_a_path_is_moved_on_to_the_time_of_the_message() -> None:
     """38 ms at 10 m/s are 0.38 m; of 30 steps, 29 are left."""
     path = moved_on(one_car(), 0, 0)
@@ -315,6 +470,21 @@ def test_a_bag_is_not_written_over(
     command = ["convert", str(recording.paths[0]), "--to", "rosbag2", "--out", str(tmp_path)]
     assert main(command) == 2
     assert "a new folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["-", "out.jsonl"])
+def test_what_is_missing_of_a_recording_is_said(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    """Also where its predictions go to standard output, and not among them."""
+    torn = tmp_path / recording.paths[0].name
+    torn.write_bytes(recording.paths[0].read_bytes()[:-1000])
+    file = out if out == "-" else str(tmp_path / out)
+    assert main(["convert", str(torn), "--to", "jsonl", "--out", file]) == 0
+    told = capsys.readouterr()
+    assert told.err.count("\n") == 1
+    assert "read up to there" in told.err
+    assert "read up to there" not in told.out
 
 
 # --- text
@@ -350,5 +520,5 @@ def test_json_lines_are_those_of_replay(recording: Recording, tmp_path: Path) ->
 def test_times_are_told_by_the_wall_clock() -> None:
     """A target measured 50 ms before its prediction was finished, 2 ms before it was recorded."""
     car: ForecastSet = one_car()
-    moment = Moment(5_000_000_000, car)
+    moment = Moment(5_000_000_000, car, {})
     assert moment.wall_ns(float(car.anchor_s[0])) == pytest.approx(4_950_000_000, abs=1000)

@@ -167,6 +167,7 @@ def test_what_is_not_known_is_not_plotted() -> None:
     assert not any(name.startswith("/ego/") for name in plotted)
     (payload,) = encode_cycle(nobody())
     assert plotted_of(payload)["/cycle/objects"] == 0
+    assert plotted_of(payload)["/timestamp"] == 1000.012  # silence goes on in time
     quiet = replace_status(latencies_s=[], seconds=0.0)
     assert not {"/status/latency_worst_ms", "/status/messages_per_s"} & set(plotted_of(quiet))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -190,6 +191,33 @@ def test_arrays_that_do_not_fit_their_shape_are_refused(shape: tuple[int, ...]) 
     told = msgspec.msgpack.decode(payload)
     with pytest.raises(ValueError, match=r"shape|reshape"):
         decode_datagram(msgspec.msgpack.encode(told | {"shape": shape}))
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"part": 1},
+        {"part": -1},
+        {"parts": 0},
+        {"dt_s": 0.0},
+        {"dt_s": -0.1},
+        {"dt_s": math.nan},
+        {"timestamp_s": math.nan},
+        {"made_s": math.inf},
+        {"mode": 77},
+        {"agent_mode": b"\x63"},
+        {"shape": (1, 20, 0, 30), "trajectories": b"", "probabilities": b""},
+        {"shape": (1, 20, 2, 0), "trajectories": b""},
+    ],
+    ids=str,
+)
+def test_numbers_that_no_service_says_are_refused(odd: dict[str, object]) -> None:
+    """Whoever hears them divides by them, counts with them, and looks names up."""
+    (payload,) = encode_datagrams(one_car())
+    told = msgspec.msgpack.decode(payload)
+    decode_datagram(msgspec.msgpack.encode(told))
+    with pytest.raises(ValueError, match=r"not a datagram of eqrt|not a valid Mode"):
+        decode_datagram(msgspec.msgpack.encode(told | odd))
 
 
 def test_half_a_datagram_is_refused() -> None:

@@ -164,6 +164,21 @@ def test_status_says_how_the_recording_goes(drives: dict[str, tuple[Path, Heard]
     assert sum(isinstance(one, ServiceStatus) for one in entries) == len(heard.statuses)
 
 
+def test_predictions_are_told_while_the_file_is_read(
+    drives: dict[str, tuple[Path, Heard]], tmp_path: Path
+) -> None:
+    """Not when all of them lie in memory: the end, which is torn off, has not been seen yet."""
+    (file,) = recordings_in(drives["ngsim"][0] / "rec")
+    torn = tmp_path / file.name
+    torn.write_bytes(file.read_bytes()[:-1000])
+    (recording,) = read_recordings(tmp_path)
+    forecasts = recording.forecasts()
+    first = next(forecasts)
+    assert recording.cut == []
+    assert [first.cycle, *(later.cycle for later in forecasts)][:3] == [0, 1, 2]
+    assert len(recording.cut) == 1
+
+
 # --- being killed
 
 

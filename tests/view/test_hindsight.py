@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -113,6 +114,72 @@ def test_the_score_keeps_its_size_however_long_it_runs() -> None:
     assert all(len(places._times_s) <= 82 for places in board._places.values())
 
 
+def silence(after: ForecastSet, number: int) -> ForecastSet:
+    """What a service says every 0.1 s while no input comes, with the last measurement's time."""
+    return replace(
+        after,
+        cycle=after.cycle + 1 + number,
+        mode=Mode.SILENT,
+        made_s=after.made_s + 0.3 + 0.1 * number,
+        map_from_ego=None,
+    ).targets(slice(0))
+
+
+def test_silence_costs_nothing_however_long_it_lasts() -> None:
+    """A parked car's bus sleeps for days."""
+    hindsight = Hindsight()
+    for cycle in range(60):
+        hindsight.add(crowd(cycle, 3))
+    assert hindsight.score() is not None
+    before = len(hindsight._recent), len(hindsight._board._pending)
+    for number in range(1000):
+        hindsight.add(silence(crowd(59, 3), number))
+    assert (len(hindsight._recent), len(hindsight._board._pending)) <= before
+    assert hindsight.score() is None  # the last minute had nothing to judge
+
+
+def test_time_goes_on_in_silence_and_after_it() -> None:
+    """What ends it was measured before it was last said: neither steps back."""
+    watch, minute = Watch(), LastMinute()
+    for cycle in range(3):
+        watch.add(crowd(cycle, 2))
+    for number in range(1000):
+        minute.add(watch.time_s, watch.update(silence(crowd(2, 2), number)))
+    assert watch.time_s - watch.mode_since_s == pytest.approx(99.9)  # of silence
+    assert len(list(minute.newest_first())) == pytest.approx(601, abs=1)
+    said_s = watch.time_s
+    again = replace(crowd(1004, 2), timestamp_s=said_s - 0.05)
+    watch.add(again)
+    assert said_s < watch.time_s < said_s + 0.05
+    watch.add(crowd(1005, 2, start_s=0.1))
+    assert watch.time_s == pytest.approx(100.6)
+    assert watch.stream == 0
+
+
+def test_drives_of_several_starts_are_one_timeline() -> None:
+    """The clock of the second begins anew with its computer; that of the third goes on for days."""
+    watch = Watch(joins_runs=True)
+    times_s = []
+    for start_s in (500.0, 20.0, 1e6):
+        for cycle in range(5):
+            watch.add(crowd(cycle, 2, start_s=start_s))
+            times_s.append(watch.time_s)
+    steps_s = [after - before for before, after in itertools.pairwise(times_s)]
+    assert steps_s == pytest.approx([0.1] * 4 + [1.0] + [0.1] * 4 + [1.0] + [0.1] * 4)
+    assert watch.time_s - watch.shift_s == pytest.approx(1e6 + 0.4)
+
+
+def test_what_was_no_prediction_has_no_ghost() -> None:
+    """Of who was just found, and nothing told how it moved."""
+    hindsight = Hindsight()
+    then, now = crowd(0, AGENTS), crowd(10, AGENTS)
+    then.velocity[:6] = np.nan
+    hindsight.add(then)
+    known = ~np.isnan(hindsight.add(now).error_m[:, 0])
+    assert not known[:6].any()
+    assert known[6:].sum() > 3
+
+
 def test_a_service_that_starts_again_is_another_stream() -> None:
     watch = Watch()
     for cycle in range(30):
@@ -162,6 +229,29 @@ def test_cycles_that_did_not_come_whole_are_counted() -> None:
     assert joiner.lost_cycles == 3  # 1 in part, 3 and 4
     assert hear(0) == 1  # a service that started again has lost nothing
     assert joiner.lost_cycles == 3
+
+
+def test_parts_of_different_cycles_make_no_cycle() -> None:
+    """Of two services at one address, or of one that started again within a cycle."""
+    here, there = ([part_of(p) for p in encode_datagrams(crowd(0, n))] for n in (200, 190))
+    other_model = [replace(one, forecasts=replace(one.forecasts, model_id="other")) for one in here]
+    joiner = Joiner()
+    last = len(here) - 1
+    for one in (here[0], here[0], *here[2:], *other_model[:last]):  # twice; without 1; no last one
+        assert joiner.add(one) is None
+    assert joiner.lost_cycles == 2
+    assert joiner.add(there[0]) is None
+    assert joiner.lost_cycles == 3
+    later = [joiner.add(one) for one in reversed(here)]  # in whatever order they come
+    assert later[:-1] == [None] * last
+    assert later[-1] is not None
+    np.testing.assert_array_equal(later[-1].track_id, crowd(0, 200).track_id)
+
+
+def part_of(payload: bytes) -> Datagram:
+    part = decode_datagram(payload)
+    assert isinstance(part, Datagram)
+    return part
 
 
 def test_the_last_minute_is_bounded_in_time_and_in_bytes() -> None:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from browser import Browser
@@ -26,6 +27,7 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.prediction.tiles import load_tile
 from processes import PATIENCE_S, Heard, Serving
+from recorded_drives import recorded_drive
 from viewing import Viewing, artifact, watched
 
 TILE_ID = load_tile(TILE).info.tile_id
@@ -192,7 +194,8 @@ def test_a_click_selects_an_agent_and_shows_its_numbers(
     browser: Browser, ngsim: tuple[Viewing, Heard, Serving]
 ) -> None:
     browser.open(ngsim[0].address)
-    wait(browser, f"e.agents.length > 5 && e.ghosts > 10 && {FULL_SERVICE}")
+    long_seen = "e.ghosts > 2 * e.agents.length"  # and not just found, as when the log begins again
+    wait(browser, f"e.agents.length > 5 && {long_seen} && {FULL_SERVICE}")
     browser.press("p")
     wait(browser, "e.paused")
     agent = browser.evaluate(
@@ -356,6 +359,146 @@ def test_a_file_plays_pauses_and_can_be_gone_through(browser: Browser, tmp_path:
         wait(browser, "e.moment.cycle === 299")
         browser.screenshot(artifact("view-file.png"))
         assert browser.console() == []
+
+
+def test_north_is_shown_where_it_is_known(browser: Browser) -> None:
+    """Without a pose in a map, the map frame begins as the ego vehicle stood when it began."""
+
+    def change(forecast: ForecastSet) -> ForecastSet:
+        on_map = forecast.cycle % 40 >= 20
+        mode, tile_id = (Mode.RUN, TILE_ID) if on_map else (Mode.NO_POSE, "")
+        return replace(forecast, mode=mode, tile_id=tile_id)
+
+    with Viewing() as viewing, sending(viewing, change):
+        browser.open(viewing.address)
+        wait(browser, "e.agents.length === 8")
+        browser.press("n", "n")
+        for north, words in (("false", "Not turning"), ("true", "North up")):
+            wait(
+                browser,
+                f"e.north === {north} && document.getElementById('turn').innerText === '{words}'",
+            )
+            browser.screenshot(artifact(f"view-north-{north}.png"))
+        assert browser.console() == []
+
+
+def test_who_is_not_predicted_has_no_paths(browser: Browser) -> None:
+    def change(forecast: ForecastSet) -> ForecastSet:
+        forecast.velocity[:] = math.nan
+        forecast.agent_mode[:] = Mode.PARTIAL
+        forecast.trajectories[:] = forecast.position[:, None, None]
+        return replace(forecast, covariances=None)
+
+    with Viewing() as viewing, sending(viewing, change):
+        browser.open(viewing.address)
+        wait(browser, "e.agents.length === 8")
+        browser.press("Enter")
+        wait(browser, "e.selected !== null")
+        panel = text(browser, "#selected")
+        browser.screenshot(artifact("view-not-predicted.png"))
+    assert "Not predicted: nothing tells how it moves." in panel
+    assert "path 1" not in panel
+
+
+def test_silence_lasts_and_can_be_stepped_through(browser: Browser) -> None:
+    """The service repeats the time of its last measurement in it."""
+    last: list[ForecastSet] = []
+
+    def change(forecast: ForecastSet) -> ForecastSet:
+        if forecast.cycle < 20:
+            last[:] = [forecast]
+            return forecast
+        silent = replace(forecast, timestamp_s=last[0].timestamp_s, mode=Mode.SILENT)
+        return silent.targets(slice(0))
+
+    with Viewing() as viewing, sending(viewing, change):
+        browser.open(viewing.address)
+        wait(browser, "/earlier predictions are void, for [2-9] s/.test(e.words)")
+        assert shown(browser, "agents") == []
+        browser.press("p")
+        wait(browser, "e.paused")
+        cycle = shown(browser, "moment")["cycle"]
+        browser.press("ArrowLeft", "ArrowLeft", "ArrowLeft")
+        wait(browser, f"e.moment.cycle === {cycle - 3}")
+        browser.press(*["ArrowLeft"] * (cycle - 3 - 19))
+        wait(browser, "e.moment.cycle === 19 && e.agents.length === 8")
+
+
+def test_another_source_at_the_same_address_is_looked_at_anew(
+    browser: Browser, tmp_path: Path
+) -> None:
+    """JSON lines know no ego vehicle: the picture follows the traffic, wherever it is."""
+    path = tmp_path / "replayed.jsonl"
+    path.write_bytes(b"".join(json_lines(far_away(crowd(n, 8))) for n in range(200)))
+    with Viewing() as viewing, sending(viewing):
+        browser.open(viewing.address)
+        wait(browser, "e.agents.length === 8")
+        browser.press("Enter")
+        wait(browser, "e.selected !== null")
+        port = int(viewing.host.rpartition(":")[2])
+    with Viewing(str(path), port=port):
+        wait(browser, "e.connected && e.kept === 200 && e.agents.length === 8")
+        wait(browser, "e.pixels.some(a => a.px > 0 && a.px < 1280 && a.py > 0 && a.py < 720)")
+        assert shown(browser, "selected") is None
+
+
+def far_away(forecast: ForecastSet) -> ForecastSet:
+    away = np.array([40_000.0, -7_000.0])
+    return replace(
+        forecast,
+        position=forecast.position + away,
+        trajectories=forecast.trajectories + away,
+    )
+
+
+def test_a_file_of_several_starts_plays_through(browser: Browser, tmp_path: Path) -> None:
+    """The second drive's clock is behind the first one's, as after a restart of the computer."""
+    path = tmp_path / "drives.jsonl"
+    drives = [(cycle, start_s) for start_s in (900.0, 30.0) for cycle in range(30)]
+    lines = [json_lines(crowd(cycle, 8, start_s=start_s)) for cycle, start_s in drives]
+    path.write_bytes(b"".join(lines))
+    with Viewing(str(path)) as viewing:
+        browser.open(viewing.address)
+        wait(browser, "e.kept === 60 && e.moment && e.agents.length === 8")
+        wait(browser, "document.getElementById('when').innerText.endsWith('of 0:06.8')")
+        browser.press("Enter")
+        wait(browser, "e.selected !== null && e.moment.cycle > 20")
+        wait(browser, "e.moment.time_s > 904.5 && e.moment.cycle < 20 && e.selected === null")
+        wait(browser, "e.paused && e.moment.cycle === 29")
+
+
+def test_a_folder_of_drives_is_shown_with_what_ran_in_each(
+    browser: Browser, tmp_path: Path
+) -> None:
+    """Real ones, with a map and without; the second was killed."""
+    folder = tmp_path / "drives"
+    for name in ("ngsim", "rav4"):
+        with recorded_drive(name, folder, tmp_path / f"{name}.log", until=25) as (service, _):
+            service.end(signal.SIGTERM if name == "ngsim" else signal.SIGKILL)
+    what = "document.getElementById('what').innerText"
+    with Viewing(str(folder)) as viewing:
+        browser.open(viewing.address)
+        wait(browser, "e.lanes > 0 && e.agents.length > 10")
+        wait(browser, f"/profile generic.* map ngsim.tile/.test({what})")
+        browser.screenshot(artifact("view-folder.png"))
+        wait(browser, f"/toyota-rav4.* no map/.test({what})")
+        wait(browser, "e.paused && e.lanes === 0 && e.agents.length > 2")
+        browser.press(*["ArrowLeft"] * 40)
+        wait(browser, "e.lanes > 0")
+        wait(browser, f"/profile generic/.test({what})")
+        assert browser.console() == []
+
+
+def test_where_a_file_has_nothing_it_says_so(browser: Browser, tmp_path: Path) -> None:
+    """JSON lines have none in silence, and nobody is said to be where he was long ago."""
+    path = tmp_path / "gap.jsonl"
+    cycles_ = [*range(10), *range(110, 120)]
+    path.write_bytes(b"".join(json_lines(crowd(cycle, 8)) for cycle in cycles_))
+    with Viewing(str(path)) as viewing:
+        browser.open(viewing.address)
+        wait(browser, "/^Nothing is recorded here, for [2-9] s/.test(e.words)")
+        browser.screenshot(artifact("view-file-gap.png"))
+        wait(browser, "e.moment.cycle >= 110 && e.words.startsWith('No map here')")
 
 
 def test_dark_and_narrow(browser: Browser, ngsim: tuple[Viewing, Heard, Serving]) -> None:

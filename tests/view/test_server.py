@@ -354,6 +354,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(
         (["--port", "70000"], "--port is 70000"),
         (["--datagrams", "nowhere"], "give HOST:PORT"),
         (["missing.jsonl"], "no such file"),
+        ([str(PAGE)], "there is no recording of eqrt in it"),
         (["--tile", "missing.tile", "--datagrams", "127.0.0.1:0"], "no such tile file"),
     ],
 )

@@ -13,6 +13,7 @@ import termios
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 from rich.console import Console, ConsoleDimensions
@@ -20,6 +21,7 @@ from rich.console import Console, ConsoleDimensions
 from crowd import crowd, cycles
 from eqrt.cli import main
 from eqrt.runtime.output.datagrams import DatagramPublisher
+from eqrt.runtime.output.forecasts import Mode
 from eqrt.runtime.view.top import State, render
 from processes import EQRT, PATIENCE_S, environment
 from viewing import free_udp_port
@@ -161,6 +163,19 @@ def test_while_a_filter_is_typed_letters_are_letters() -> None:
     assert state.pattern == "tru"
     assert state.ended
     assert {track.kind for track in state.shown()} == {"truck"}
+
+
+def test_it_says_for_how_long_no_input_has_come() -> None:
+    state = State(address="here")
+    last = crowd(0, 3)
+    for number in range(80):
+        made_s = last.made_s + 0.3 + 0.1 * number
+        silent = replace(last, cycle=1 + number, mode=Mode.SILENT, made_s=made_s)
+        state.take(silent.targets(slice(0)), 0.0)
+    console = Console(width=100, height=30)
+    with console.capture() as capture:
+        console.print(render(state, console.size, 0.0))
+    assert "No input from the sensor: earlier predictions are void, for 8 s" in capture.get()
 
 
 def test_the_nearest_track_comes_first_and_no_screen_is_too_small() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +22,11 @@ from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.runtime.view.hindsight import Hindsight
-from eqrt.runtime.view.recorded import read_records
+from eqrt.runtime.view.playback import Playback
+from eqrt.runtime.view.recorded import Record, TileUsed, read_records
+from eqrt.runtime.view.server import Wanted
 from eqrt.runtime.view.updates import STEP_M, course_rad, decode_update, encode_update
-from eqrt.runtime.view.watch import Lanes, Watch
+from eqrt.runtime.view.watch import NO_LANES, Lanes, Watch
 from eqrt.runtime.view.words import DROPS, LEVELS, drops, mode_words
 from forecast_sets import many, nobody, one_car
 from recorded_drives import recorded_drive
@@ -30,7 +34,15 @@ from recorded_drives import recorded_drive
 
 def update_of(forecast: ForecastSet) -> bytes:
     ghosts = Hindsight().add(forecast)
-    return encode_update(forecast, ghosts=ghosts, score=None, stream=0, mode_since_s=0.0)
+    return encode_update(
+        forecast,
+        ghosts=ghosts,
+        score=None,
+        stream=0,
+        time_s=forecast.moment_s,
+        mode_since_s=0.0,
+        lanes=NO_LANES,
+    )
 
 
 def test_places_come_back_to_a_centimetre() -> None:
@@ -92,7 +104,7 @@ def test_what_only_seems_to_stand_is_not_said_to_be_predicted() -> None:
         assert agents["words"] == ["not predicted: nothing tells how it moves"]
         assert agents["speed_mps"] == [None]
     agents = decode_update(update_of(one_car()))[0]["agents"]
-    assert agents["words"] == ["from a short history"]
+    assert agents["words"] == ["predicted from a short history"]
 
 
 def test_an_ellipse_holds_half_of_the_distribution() -> None:
@@ -130,9 +142,10 @@ def test_lanes_are_told_around_the_ego_vehicle_and_again_when_it_has_driven_on()
 
     def there(ahead_m: float) -> ForecastSet:
         pose = Pose2(x_m + ahead_m, y_m, 0.0)
-        return replace(one_car(), tile_id="e66f7853", mode=Mode.RUN, map_from_ego=pose)
+        tile_id = "e66f7853" if ahead_m else ""
+        return replace(one_car(), tile_id=tile_id, mode=Mode.RUN, map_from_ego=pose)
 
-    first = lanes.near(there(0.0))
+    first = lanes.near(there(0.0).targets(slice(0)))  # on an empty road no lanes are looked for
     assert first is not None
     told = json.loads(first)
     points = np.array(told["lanes"][0]).reshape(-1, 2) / 100.0 + told["origin"]
@@ -160,10 +173,67 @@ def test_the_map_is_the_one_that_the_service_says(tmp_path: Path) -> None:
     assert lanes.near(there) is not None
     assert len(lanes.recent) == 1
     assert lanes.hear(status_with(TILE, "0ddba12"))
-    assert not lanes.recent  # of the map before
+    assert lanes.number == NO_LANES  # until the first cycle on it
 
 
-def status_with(tile: Path, tile_id: str) -> ServiceStatus:
+@pytest.mark.parametrize("exchanged", [(None, ""), ("gone.tile", "0badc0de")])
+def test_lanes_of_a_map_that_is_used_no_more_are_not_shown(
+    tmp_path: Path, exchanged: tuple[str | None, str]
+) -> None:
+    """Whether the service has none now, or one that the view cannot read; what is wrong is said
+    until it is right again. Who steps back finds the lanes that there were.
+    """
+    tile = load_tile(TILE)
+    x_m, y_m = tile.lane_map.lane_points(0)[0].tolist()
+    place = Pose2(x_m, y_m, 0.0)
+    there = replace(one_car(), tile_id=tile.info.tile_id, mode=Mode.RUN, map_from_ego=place)
+    name, tile_id = exchanged
+    lanes = Lanes()
+    assert lanes.hear(status_with(TILE, tile.info.tile_id)) == ""
+    told = lanes.near(there)
+    assert told is not None
+    assert json.loads(told)["number"] == lanes.number == 0
+    for _ in range(2):
+        said = lanes.hear(status_with(tmp_path / name if name else None, tile_id))
+        assert said.startswith("no lanes are shown: ") == (name is not None)
+    assert lanes.near(there) is None
+    assert lanes.number == NO_LANES
+    assert lanes.hear(status_with(TILE, tile.info.tile_id)) == ""
+    assert lanes.near(there) is not None
+    assert lanes.number == 1
+    assert len(lanes.recent) == 2
+
+
+def test_a_file_tells_the_lanes_of_the_cycles_that_are_asked_for() -> None:
+    """Of each map that was used in it, and of none where there was none."""
+    tile = load_tile(TILE)
+    x_m, y_m = tile.lane_map.lane_points(0)[0].tolist()
+    place = Pose2(x_m, y_m, 0.0)
+    maps = [tile, None, replace(tile, info=replace(tile.info, tile_id="0ddba11"))]
+
+    def records() -> Iterator[Record]:
+        for drive, used in enumerate(maps):
+            yield TileUsed(used)
+            for cycle in range(10 * drive, 10 * drive + 10):
+                mode = Mode.RUN if used else Mode.NO_MAP
+                yield replace(crowd(cycle, 3), mode=mode, map_from_ego=place)
+
+    with Playback(records(), "drive", None) as playback:
+        while not playback.done:
+            time.sleep(0.01)
+        for first, expected in ((0, [0]), (10, []), (20, [1])):
+            answers = list(playback.find(Wanted(first=first, last=first + 10)))
+            told = [json.loads(answer) for answer in answers if isinstance(answer, str)]
+            assert [one["number"] for one in told] == expected
+            assert all(one["lanes"] for one in told)
+            heads = [decode_update(one)[0] for one in answers if isinstance(one, bytes)]
+            assert {head["lanes"] for head in heads} == set(expected or [NO_LANES])
+        whole = list(playback.find(Wanted(first=0, last=30, lanes=1)))
+        assert sum(isinstance(answer, str) for answer in whole) == 1
+        assert playback.trouble == ""
+
+
+def status_with(tile: Path | None, tile_id: str) -> ServiceStatus:
     return ServiceStatus(
         time_s=1.0,
         uptime_s=1.0,
@@ -172,7 +242,7 @@ def status_with(tile: Path, tile_id: str) -> ServiceStatus:
         profile="generic",
         model="m",
         model_id="",
-        tile=str(tile),
+        tile=str(tile or ""),
         tile_id=tile_id,
         mode=Mode.RUN,
         mode_s=1.0,
@@ -215,6 +285,9 @@ def test_a_recording_is_what_the_service_said_of_itself_too(tmp_path: Path) -> N
     cycles = [record for record in records if isinstance(record, ForecastSet)]
     assert [one.cycle for one in cycles] == [one.cycle for one in heard.forecasts]
     assert all(one.history_valid.any() for one in cycles if one.num_targets)
+    assert isinstance(records[0], TileUsed)  # and travels with it, wherever it is watched
+    assert records[0].tile is not None
+    assert records[0].tile.info.tile_id == load_tile(TILE).info.tile_id
     statuses = [record for record in records if isinstance(record, ServiceStatus)]
     assert [one.time_s for one in statuses] == [one.time_s for one in heard.statuses]
     (file,) = folder.glob("*.mcap")

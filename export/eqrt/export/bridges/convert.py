@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,9 +44,9 @@ def run(args: argparse.Namespace) -> int:
         ) from error
     if args.out != "-":
         print(f"eqrt convert: {count} {what} to {args.out}")
-        for one in recordings:
-            if one.remark:
-                print(f"eqrt: {one.remark}")
+    for one in recordings:
+        if one.remark:
+            print(f"eqrt: {one.remark}", file=sys.stderr)
     return 0
 
 

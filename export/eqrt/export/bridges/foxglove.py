@@ -1,7 +1,8 @@
 """A recording as Foxglove's own messages: an MCAP that its 3D, Plot and Log panels show at once.
 
 Schemas are those that Foxglove publishes, as protobuf; numbers to plot and the service's status are
-JSON, which PlotJuggler reads as well. Frames: `map`, and `ego` in it.
+JSON, which PlotJuggler reads as well. Frames: `map` (`odom` while no map pose is known), and `ego`
+in it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -21,6 +23,7 @@ from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
@@ -33,17 +36,16 @@ from numpy.typing import NDArray
 
 from eqrt.core.lanes import LaneMap
 from eqrt.core.tile import decode
-from eqrt.export.bridges.moments import HEIGHT_M, Moment, headings, moments, sizes
+from eqrt.export.bridges.moments import EGO, HEIGHT_M, MAP, Moment, moments, sizes, world_frame
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.json_schemas import json_schema
 from eqrt.runtime.recording.reader import Recording
 from eqrt.runtime.recording.topics import TILE_FILE
 from eqrt.runtime.status_book import status_line
-from eqrt.runtime.view.updates import ego_pose
+from eqrt.runtime.view.updates import course_rad, ego_pose
 
-MAP, EGO = "map", "ego"
-_SHOWN_S = 0.5  # an object that is predicted no more disappears
+_SHOWN_S = 0.5  # where cycles stop coming, what they said disappears
 _PROTOBUF: dict[str, Any] = {
     "/scene": SceneUpdate,
     "/lanes": SceneUpdate,
@@ -77,17 +79,16 @@ def write_foxglove(recordings: Iterable[Recording], out: IO[bytes]) -> int:
     channels = {topic: _protobuf_channel(writer, topic) for topic in _PROTOBUF}
     channels["/cycle"] = _json_channel(writer, "/cycle", "eqrt.Cycle", Cycle)
     channels["/status"] = _json_channel(writer, "/status", "eqrt.Status", ServiceStatus)
-    cycles = 0
+    cycles, attached = 0, None
     for recording in recordings:
-        lanes = _lanes(recording)
         for moment in moments(recording):
 
             def put(topic: str, content: bytes, moment: Moment = moment) -> None:
                 writer.add_message(channels[topic], moment.log_ns, content, moment.log_ns)
 
-            if lanes is not None:
-                put("/lanes", lanes.SerializeToString())
-                lanes = None
+            if moment.attached is not attached:
+                attached = moment.attached
+                put("/lanes", _lanes(moment).SerializeToString())
             if isinstance(moment.entry, ForecastSet):
                 cycles += 1
                 _put_cycle(put, moment, moment.entry)
@@ -99,14 +100,14 @@ def write_foxglove(recordings: Iterable[Recording], out: IO[bytes]) -> int:
 
 
 def _put_cycle(put: Any, moment: Moment, forecasts: ForecastSet) -> None:
-    measured = _timestamp(moment.wall_ns(forecasts.timestamp_s))
+    measured = _timestamp(moment.wall_ns(forecasts.moment_s))
     put("/cycle", msgspec.json.encode(_cycle(forecasts)))
     pose = ego_pose(forecasts)
-    if pose is not None and forecasts.mode is not Mode.NO_POSE:
+    if pose is not None:
         x_m, y_m, yaw_rad = pose
         transform = FrameTransform(
             timestamp=measured,
-            parent_frame_id=MAP,
+            parent_frame_id=world_frame(forecasts),
             child_frame_id=EGO,
             translation=Vector3(x=x_m, y=y_m),
             rotation=_turned(yaw_rad),
@@ -131,12 +132,14 @@ def _cycle(forecasts: ForecastSet) -> Cycle:
 
 
 def _scene(measured: Timestamp, forecasts: ForecastSet) -> SceneUpdate:
-    heading, size = headings(forecasts), sizes(forecasts)
+    """Everybody who is predicted now, and nobody who was before."""
+    heading, size = course_rad(forecasts), sizes(forecasts)
     return SceneUpdate(
+        deletions=[SceneEntityDeletion(timestamp=measured, type=SceneEntityDeletion.ALL)],
         entities=[
             _entity(measured, forecasts, row, float(heading[row]), size[row])
             for row in range(forecasts.num_targets)
-        ]
+        ],
     )
 
 
@@ -147,17 +150,29 @@ def _entity(
     heading_rad: float,
     size: NDArray[np.float64],
 ) -> SceneEntity:
-    """One target: a box, its past, every mode as strong as it is probable, its numbers."""
+    """One target: a box, its past, every mode as strong as it is probable, its numbers; a cylinder
+    where `heading_rad` is NaN.
+    """
     x, y = forecasts.position[row].tolist()
     colour = _ORANGE if forecasts.agent_mode[row] == Mode.FALLBACK else _BLUE
     seen = forecasts.history[row][forecasts.history_valid[row]]
     modes = zip(forecasts.trajectories[row], forecasts.probabilities[row].tolist(), strict=True)
     start = forecasts.position[row][None]
-    box = CubePrimitive(
-        pose=Pose(position=Vector3(x=x, y=y, z=HEIGHT_M / 2), orientation=_turned(heading_rad)),
-        size=Vector3(x=float(size[0]), y=float(size[1]), z=HEIGHT_M),
-        color=_color(colour, 0.6),
-    )
+    length_m, width_m = size.tolist()
+    place, colour_of_it = Vector3(x=x, y=y, z=HEIGHT_M / 2), _color(colour, 0.6)
+    boxes, cylinders = [], []
+    if math.isnan(heading_rad):
+        upright = Pose(position=place, orientation=_turned(0.0))
+        across = Vector3(x=width_m, y=width_m, z=HEIGHT_M)
+        cylinders = [
+            CylinderPrimitive(
+                pose=upright, size=across, bottom_scale=1.0, top_scale=1.0, color=colour_of_it
+            )
+        ]
+    else:
+        turned = Pose(position=place, orientation=_turned(heading_rad))
+        extent = Vector3(x=length_m, y=width_m, z=HEIGHT_M)
+        boxes = [CubePrimitive(pose=turned, size=extent, color=colour_of_it)]
     label = TextPrimitive(
         pose=Pose(position=Vector3(x=x, y=y, z=HEIGHT_M + 1.0)),
         billboard=True,
@@ -172,25 +187,32 @@ def _entity(
     ]
     return SceneEntity(
         timestamp=measured,
-        frame_id=MAP,
+        frame_id=world_frame(forecasts),
         id=f"track {forecasts.track_id[row]}",
         lifetime=Duration(nanos=round(_SHOWN_S * 1e9)),
-        cubes=[box],
+        cubes=boxes,
+        cylinders=cylinders,
         lines=[_line(seen, _color(_GREY, 0.8), 0.15), *paths],
         texts=[label],
     )
 
 
-def _lanes(recording: Recording) -> SceneUpdate | None:
-    content = recording.attached.get(TILE_FILE)
+def _lanes(moment: Moment) -> SceneUpdate:
+    """Those of the tile that predicts from now on, and none of another one."""
+    now = _timestamp(moment.log_ns)
+    update = SceneUpdate(
+        deletions=[SceneEntityDeletion(timestamp=now, type=SceneEntityDeletion.ALL)]
+    )
+    content = moment.attached.get(TILE_FILE)
     if content is None:
-        return None
-    lane_map: LaneMap = decode(content, str(recording.paths[0]))[0]
+        return update
+    lane_map: LaneMap = decode(content, TILE_FILE)[0]
     lines = [
         _line(lane_map.lane_points(lane).astype(np.float64), _color(_GREY, 0.5), 0.1)
         for lane in range(lane_map.num_lanes)
     ]
-    return SceneUpdate(entities=[SceneEntity(frame_id=MAP, id="lanes", lines=lines)])
+    update.entities.append(SceneEntity(timestamp=now, frame_id=MAP, id="lanes", lines=lines))
+    return update
 
 
 def _line(points: NDArray[np.float64], color: Color, width_m: float) -> LinePrimitive:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.runtime.output.forecasts import ForecastSet
+from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.recording.reader import Recording
+from eqrt.runtime.recording.reader import Exchanged, Recording
 from eqrt.runtime.recording.topics import Topic
 
 _SHOWN = frozenset({Topic.FORECASTS, Topic.STATUS})
@@ -23,6 +23,8 @@ class Moment:
     log_ns: int
     """When it was recorded, ns since 1970."""
     entry: ForecastSet | ServiceStatus
+    attached: Mapping[str, bytes]
+    """The files that travel with it, by name: the tile among them."""
 
     def wall_ns(self, time_s: float) -> int:
         """The wall-clock time of `time_s` on the service's clock; exact to the recording's delay,
@@ -34,16 +36,22 @@ class Moment:
 
 def moments(recording: Recording) -> Iterator[Moment]:
     """Every cycle and report, in recorded order."""
+    attached = recording.attached
     for one in recording.entries(_SHOWN):
-        if isinstance(one.entry, ForecastSet | ServiceStatus):
-            yield Moment(one.log_ns, one.entry)
+        if isinstance(one.entry, Exchanged):
+            attached = one.entry.attached
+        elif isinstance(one.entry, ForecastSet | ServiceStatus):
+            yield Moment(one.log_ns, one.entry, attached)
 
 
-def headings(forecasts: ForecastSet) -> NDArray[np.float64]:
-    """(A,) where each target looks, rad: as the sensor says, else as it moves, else east."""
-    moving = np.arctan2(forecasts.velocity[:, 1], forecasts.velocity[:, 0])
-    known = np.where(np.isfinite(forecasts.heading_rad), forecasts.heading_rad, moving)
-    return np.where(np.isfinite(known), known, 0.0)
+MAP, ODOM, EGO = "map", "odom", "ego"
+
+
+def world_frame(forecasts: ForecastSet) -> str:
+    """What the places of a cycle are told in, in ROS's words: MAP, or ODOM where no map pose is
+    known, whose origin is where the service began.
+    """
+    return ODOM if forecasts.mode is Mode.NO_POSE else MAP
 
 
 DEFAULT_LENGTH_M, DEFAULT_WIDTH_M, HEIGHT_M = 4.5, 1.8, 1.5

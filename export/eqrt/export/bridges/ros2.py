@@ -2,8 +2,8 @@
 
 The field definitions are those that Autoware publishes (deploy/examples/ros2.md has our fields
 beside theirs). One message per cycle, stamped with its newest measurement; an object measured
-earlier has its path moved on to that time by interpolation. What we do not know is 0, and existence
-and class are given as certain.
+earlier has its path moved on to that time by interpolation. What we do not know is 0
+beside a variance of UNKNOWN_VARIANCE (docs/recording.md); existence and class are given as certain.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from eqrt.export.bridges.moments import HEIGHT_M, Moment, headings, moments, sizes
+from eqrt.export.bridges.moments import HEIGHT_M, Moment, moments, sizes, world_frame
 from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.recording.reader import Recording
+from eqrt.runtime.view.updates import course_rad
 
 TOPIC = "/perception/object_recognition/objects"
 """Where Autoware's planning listens."""
@@ -46,7 +47,7 @@ _DEFINITIONS = {
     ),
     "PredictedObjects": "std_msgs/Header header\nPredictedObject[] objects",
 }
-_LABELS = {  # Autoware's numbers
+_LABELS: dict[int, int] = {  # Autoware's numbers
     ObjectClass.UNKNOWN: 0,
     ObjectClass.CAR: 1,
     ObjectClass.TRUCK: 2,
@@ -56,6 +57,11 @@ _LABELS = {  # Autoware's numbers
     ObjectClass.ANIMAL: 8,
     ObjectClass.STATIC: 0,
 }
+UNKNOWN_VARIANCE = 10_000.0
+"""What Autoware's own drivers put beside a number that they did not measure. All zeros mean that
+the covariance is not known (sensor_msgs/Imu), and so the number beside it is."""
+_UNKNOWN = (UNKNOWN_VARIANCE * np.eye(6)).ravel()
+_YAW = 35  # of the 6 x 6 of a pose: x, y, z, roll, pitch, yaw
 _BOUNDING_BOX = 0
 _STANDS_M = 0.05  # between two steps, less tells no direction
 
@@ -97,12 +103,12 @@ class _Objects:
 
     def message(self, moment: Moment, forecasts: ForecastSet, run: str) -> Any:
         """One cycle."""
-        wall_ns = moment.wall_ns(forecasts.timestamp_s)
+        wall_ns = moment.wall_ns(forecasts.moment_s)
         stamp = self._new("builtin_interfaces/Time", wall_ns // 10**9, wall_ns % 10**9)
-        facing, size = headings(forecasts), sizes(forecasts)
+        facing, size = course_rad(forecasts), sizes(forecasts)
         return self._new(
             "PredictedObjects",
-            self._new("std_msgs/Header", stamp, "map"),
+            self._new("std_msgs/Header", stamp, world_frame(forecasts)),
             [
                 self._object(forecasts, row, float(facing[row]), size[row].tolist(), run)
                 for row in range(forecasts.num_targets)
@@ -110,9 +116,9 @@ class _Objects:
         )
 
     def _object(
-        self, forecasts: ForecastSet, row: int, yaw_rad: float, size: list[float], run: str
+        self, forecasts: ForecastSet, row: int, course_rad: float, size: list[float], run: str
     ) -> Any:
-        label = _LABELS[ObjectClass(int(forecasts.object_class[row]))]
+        label = _LABELS.get(int(forecasts.object_class[row]), 0)  # of a newer eqrt: not known
         uuid = bytes.fromhex(run) + bytes(4) + int(forecasts.track_id[row]).to_bytes(8, "big")
         dimensions = self._new("geometry_msgs/Vector3", *size, HEIGHT_M)
         footprint = self._new("geometry_msgs/Polygon", [])
@@ -121,25 +127,24 @@ class _Objects:
             self._new("unique_identifier_msgs/UUID", np.frombuffer(uuid, np.uint8)),
             1.0,
             [self._new("ObjectClassification", label, 1.0)],
-            self._kinematics(forecasts, row, yaw_rad),
+            self._kinematics(forecasts, row, course_rad),
             self._new("Shape", _BOUNDING_BOX, footprint, dimensions),
         )
 
-    def _kinematics(self, forecasts: ForecastSet, row: int, yaw_rad: float) -> Any:
+    def _kinematics(self, forecasts: ForecastSet, row: int, course_rad: float) -> Any:
+        """`course_rad`: NaN = not known."""
         paths = [moved_on(forecasts, row, mode) for mode in range(forecasts.trajectories.shape[1])]
-        vx, vy = np.nan_to_num(forecasts.velocity[row]).tolist()
-        ahead = vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad)
-        left = vy * math.cos(yaw_rad) - vx * math.sin(yaw_rad)
-        zero, unknown = self._vector(0.0, 0.0), np.zeros(36)
-        twist = self._new("geometry_msgs/Twist", self._vector(ahead, left), zero)
-        accel = self._new("geometry_msgs/Accel", zero, zero)
+        yaw_rad = 0.0 if math.isnan(course_rad) else course_rad
+        pose_variance = np.zeros(36)
+        pose_variance[_YAW] = UNKNOWN_VARIANCE if math.isnan(course_rad) else 0.0
         step = round(forecasts.dt_s * 1e9)
-        pose = self._pose(paths[0][0], yaw_rad)
+        pose, zero = self._pose(paths[0][0], yaw_rad), self._vector(0.0, 0.0)
+        accel = self._new("geometry_msgs/Accel", zero, zero)
         return self._new(
             "PredictedObjectKinematics",
-            self._new("geometry_msgs/PoseWithCovariance", pose, unknown),
-            self._new("geometry_msgs/TwistWithCovariance", twist, unknown),
-            self._new("geometry_msgs/AccelWithCovariance", accel, unknown),
+            self._new("geometry_msgs/PoseWithCovariance", pose, pose_variance),
+            self._twist(forecasts.velocity[row], yaw_rad),
+            self._new("geometry_msgs/AccelWithCovariance", accel, _UNKNOWN.copy()),
             [
                 self._new(
                     "PredictedPath",
@@ -150,6 +155,17 @@ class _Objects:
                 for path, probability in zip(paths, forecasts.probabilities[row], strict=True)
             ],
         )
+
+    def _twist(self, velocity: NDArray[np.float64], yaw_rad: float) -> Any:
+        """In the object's own frame; `velocity` is in the map's, NaN = not known."""
+        known = bool(np.isfinite(velocity).all())
+        vx, vy = velocity.tolist() if known else (0.0, 0.0)
+        ahead = vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad)
+        left = vy * math.cos(yaw_rad) - vx * math.sin(yaw_rad)
+        linear, angular = self._vector(ahead, left), self._vector(0.0, 0.0)
+        twist = self._new("geometry_msgs/Twist", linear, angular)
+        variance = np.zeros(36) if known else _UNKNOWN.copy()
+        return self._new("geometry_msgs/TwistWithCovariance", twist, variance)
 
     def _poses(self, path: NDArray[np.float64], yaw_rad: float) -> list[Any]:
         """Each looks where it came along; where it stands, as before."""

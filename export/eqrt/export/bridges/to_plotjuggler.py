@@ -71,7 +71,7 @@ def encode_cycle(forecasts: ForecastSet) -> Iterator[bytes]:
     head = _cycle(forecasts)
     for first in range(0, max(1, len(tracks)), TRACKS_PER_DATAGRAM):
         some = dict(tracks[first : first + TRACKS_PER_DATAGRAM])
-        yield _ENCODER.encode({"timestamp": forecasts.timestamp_s, **head, **some})
+        yield _ENCODER.encode({"timestamp": forecasts.moment_s, **head, **some})
         head = {}
 
 

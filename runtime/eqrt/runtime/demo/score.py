@@ -59,7 +59,8 @@ class Scoreboard:
             forecast.track_id.tolist(), forecast.anchor_s.tolist(), forecast.position, strict=True
         ):
             self._places.setdefault(track_id, _Places()).append(anchor_s, position)
-        self._pending.append(forecast)
+        if forecast.num_targets:
+            self._pending.append(forecast)
         self._dt_s = forecast.dt_s
         scored: list[Scored] = []
         horizon_s = forecast.trajectories.shape[2] * forecast.dt_s + MAX_GAP_S

@@ -222,10 +222,20 @@ def _wire(forecasts: ForecastSet, rows: slice, part: int, parts: int) -> _Wire:
 
 
 def _forecasts(wire: _Wire) -> ForecastSet:
-    """Raises ValueError if the arrays have not the shape that the map says, or the mode is new."""
+    """Raises ValueError if the arrays have not the shape that the map says, or a mode is new, or
+    there is a number that no service says.
+    """
     agents, steps, num_modes, horizon = wire.shape
-    if not all(0 <= size <= _MAX_UDP_BYTES for size in wire.shape):
+    least = (0, 0, 1, 1)
+    if not all(low <= n <= _MAX_UDP_BYTES for low, n in zip(least, wire.shape, strict=True)):
         raise ValueError(f"not a datagram of eqrt (shape {wire.shape})")
+    if not 0 <= wire.part < wire.parts:
+        raise ValueError(f"not a datagram of eqrt (part {wire.part} of {wire.parts})")
+    times_s = (wire.timestamp_s, wire.made_s, wire.compute_s, wire.dt_s)
+    if not (all(map(math.isfinite, times_s)) and wire.dt_s > 0.0):
+        raise ValueError(f"not a datagram of eqrt (times {times_s})")
+    for number in set(wire.agent_mode):
+        Mode(number)
     covariances = None
     if wire.covariances:
         covariances = _array(wire.covariances, agents, num_modes, horizon, 2, 2)

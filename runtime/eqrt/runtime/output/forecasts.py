@@ -51,7 +51,8 @@ class ForecastSet:
     cycle: int
     """Counts the cycles from 0, also those without targets."""
     timestamp_s: float
-    """The newest measurement used; `map_from_ego` holds at this time."""
+    """The newest measurement used, in SILENT the last that was; `map_from_ego` holds at this
+    time."""
     received_s: float
     """When the cycle's last message came; NaN = nothing came (SILENT), or it is not told."""
     made_s: float
@@ -106,6 +107,13 @@ class ForecastSet:
     def num_targets(self) -> int:
         """A."""
         return len(self.track_id)
+
+    @property
+    def moment_s(self) -> float:
+        """When what the cycle says held: at its newest measurement; in SILENT, which has none and
+        repeats the last, when it was said.
+        """
+        return self.made_s if self.mode is Mode.SILENT else self.timestamp_s
 
     @property
     def age_s(self) -> NDArray[np.float64]:

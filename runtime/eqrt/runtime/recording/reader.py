@@ -130,9 +130,8 @@ class Recording:
         waiting: list[Recorded] = []
         for raw in self._raw():
             if isinstance(raw, Exchanged):
-                if topics >= _STEPS:
-                    yield from waiting
-                    waiting = [Recorded(waiting[-1].log_ns if waiting else 0, raw)]
+                yield from waiting
+                waiting = [Recorded(waiting[-1].log_ns if waiting else 0, raw)]
                 continue
             if raw.topic is Topic.LOST:
                 self.lost += _decoded(_LOST, raw.payload, self.paths[0]).steps
@@ -146,7 +145,7 @@ class Recording:
                 outcomes = _decoded(_RUNS, raw.payload, self.paths[0])
                 _add(waiting, outcomes=outcomes)
                 continue
-            if raw.topic in _STEPS:  # what the clock said during the one before is complete
+            if raw.topic in _STEPS or not topics & _STEPS:  # what the clock said is complete
                 yield from waiting
                 waiting.clear()
             waiting.append(Recorded(raw.log_ns, self._entry(raw)))

@@ -62,8 +62,9 @@ class Hindsight:
         """Take the next cycle; says what became of earlier predictions of its targets."""
         self._tally.add(forecast, self._board.add(forecast))
         ghosts = self._ghosts(forecast)
-        self._recent.append(forecast)
-        while self._recent[0].timestamp_s < forecast.timestamp_s - _KEPT_S:
+        if forecast.num_targets:  # silence may last for days, and repeats its time
+            self._recent.append(forecast)
+        while self._recent and self._recent[0].timestamp_s < forecast.timestamp_s - _KEPT_S:
             self._recent.popleft()
         return ghosts
 
@@ -80,6 +81,8 @@ class Hindsight:
             if then is None or not now.num_targets:
                 continue
             rows, old = _same_targets(now, then)
+            predicted = ~then.is_standstill_assumed[old]
+            rows, old = rows[predicted], old[predicted]
             ahead_s = now.anchor_s[rows] - then.anchor_s[old]
             places = (_along(then, old, ahead_s), _straight_on(then, old, ahead_s))
             position[rows, column] = places[0]
@@ -151,8 +154,8 @@ class _Tally:
             ]
             self._names = list(tables[0])
             sums = np.array([list(table.values()) for table in tables]) * len(scored)
-            self._kept.append((forecast.timestamp_s, len(scored), sums))
-        while self._kept and self._kept[0][0] < forecast.timestamp_s - WINDOW_S:
+            self._kept.append((forecast.moment_s, len(scored), sums))
+        while self._kept and self._kept[0][0] < forecast.moment_s - WINDOW_S:
             self._kept.popleft()
 
     def score(self) -> Score | None:

@@ -62,15 +62,15 @@ class Live:
     def _take_cycle(self, forecast: ForecastSet, server: ViewServer) -> None:
         if (lanes := self._lanes.near(forecast)) is not None:
             server.tell("lanes", lanes)
-        update = self._watch.update(forecast)
-        self._minute.add(forecast.timestamp_s, update)
+        update = self._watch.update(forecast, lanes=self._lanes.number)
+        self._minute.add(self._watch.time_s, update)
         server.show(update)
 
     def _take_status(self, status: ServiceStatus, server: ViewServer) -> None:
         text = encode_status(status, lost_cycles=self._ear.lost_cycles)
         self._statuses.append(msgspec.Raw(text.encode()))
         server.tell("status", text)
-        self._lanes_trouble = self._lanes.hear(status) or self._lanes_trouble
+        self._lanes_trouble = self._lanes.hear(status)
 
     def _say(self, server: ViewServer) -> None:
         """What is wrong now, when it has changed."""

@@ -16,11 +16,11 @@ from pathlib import Path
 import msgspec
 
 from eqrt.core.errors import EqrtError
-from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.view.recorded import Record, TileUsed
 from eqrt.runtime.view.server import SERVER_ID, Outbox, ViewServer, Wanted
 from eqrt.runtime.view.updates import encode_status, encode_text
-from eqrt.runtime.view.watch import Lanes, Watch
+from eqrt.runtime.view.watch import NO_LANES, Lanes, Watch
 
 _TELL_S = 0.5  # how often pages hear how far the file is read
 
@@ -28,15 +28,14 @@ _TELL_S = 0.5  # how often pages hear how far the file is read
 class Playback:
     """What pages are told of a file."""
 
-    def __init__(
-        self, records: Iterable[ForecastSet | ServiceStatus], name: str, tile: Path | None
-    ) -> None:
+    def __init__(self, records: Iterable[Record], name: str, tile: Path | None) -> None:
         self._records, self._name = records, name
-        self._watch = Watch()
+        self._watch = Watch(joins_runs=True)
         self._lanes = Lanes(tile)
         self._store = _Store()
         self._times_s: list[float] = []
-        self._lanes_from: list[tuple[int, str]] = []
+        self._lanes_told: list[str] = []
+        self._lanes_at: list[int] = []
         self._statuses: list[msgspec.Raw] = []
         self._thread = threading.Thread(target=self._read, name="read", daemon=True)
         self._ended = threading.Event()
@@ -63,11 +62,10 @@ class Playback:
 
     def find(self, wanted: Wanted) -> Iterator[str | bytes]:
         """The updates of these cycles, as far as they have been read, and the lanes there."""
-        last = min(wanted.last, len(self._times_s))
-        lanes = [message for start, message in self._lanes_from if start < last]
-        if lanes and len(lanes) - 1 != wanted.lanes:
-            yield lanes[-1]
-        for number in range(max(0, wanted.first), last):
+        first, last = max(0, wanted.first), min(wanted.last, len(self._times_s))
+        for number in sorted({*self._lanes_at[first:last]} - {NO_LANES, wanted.lanes}):
+            yield self._lanes_told[number]
+        for number in range(first, last):
             yield self._store.read(number)
 
     async def tell_progress(self, server: ViewServer) -> None:
@@ -100,16 +98,21 @@ class Playback:
         finally:
             self.done = True
 
-    def _take(self, record: ForecastSet | ServiceStatus) -> None:
+    def _take(self, record: Record) -> None:
+        if isinstance(record, TileUsed):
+            self._lanes.use(record.tile)
+            return
         if isinstance(record, ServiceStatus):
             self.trouble = self._lanes.hear(record) or self.trouble
-            self._statuses.append(msgspec.Raw(encode_status(record, lost_cycles=0).encode()))
+            text = encode_status(record, lost_cycles=0, shift_s=self._watch.shift_s)
+            self._statuses.append(msgspec.Raw(text.encode()))
             return
         if (lanes := self._lanes.near(record)) is not None:
-            self._lanes_from.append((len(self._times_s), lanes))
-        update = self._watch.update(record)
+            self._lanes_told.append(lanes)
+        update = self._watch.update(record, lanes=self._lanes.number)
+        self._lanes_at.append(self._lanes.number)
         self._store.append(update)
-        self._times_s.append(record.timestamp_s)  # last: from now on it may be asked for
+        self._times_s.append(self._watch.time_s)  # last: from now on it may be asked for
 
 
 class _Store:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -17,11 +18,23 @@ from eqrt.runtime.decoding.detections import ObjectClass
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import Line
 from eqrt.runtime.output.status import ServiceStatus
+from eqrt.runtime.prediction.tiles import Tile
 from eqrt.runtime.recording.folder import SUFFIX
-from eqrt.runtime.recording.reader import read_recordings
+from eqrt.runtime.recording.reader import Exchanged, Recording, read_recordings
+from eqrt.runtime.recording.replaying import recorded_tile
 from eqrt.runtime.recording.topics import Topic
 
-Records = Iterator[ForecastSet | ServiceStatus]
+
+@dataclass(frozen=True, slots=True)
+class TileUsed:
+    """From here on, this map is predicted with."""
+
+    tile: Tile | None
+    """None = none."""
+
+
+Record = ForecastSet | ServiceStatus | TileUsed
+Records = Iterator[Record]
 
 HISTORY_S = 2.0
 _MAX_GAP_S = 0.3  # between two measurements of a track; a longer way is not drawn
@@ -48,10 +61,20 @@ def read_records(path: Path) -> Records:
 
 
 def read_recording(path: Path) -> Records:
-    """Cycles and status from what `eqrt serve --record` wrote: a file, or a folder of them."""
-    for recording in read_recordings(path):
+    """Cycles and status from what `eqrt serve --record` wrote: a file, or a folder of them.
+
+    Raises LogError at once if there is none.
+    """
+    return _records(read_recordings(path))
+
+
+def _records(recordings: list[Recording]) -> Records:
+    for recording in recordings:
+        yield TileUsed(recorded_tile(recording, recording.attached))
         for recorded in recording.entries(frozenset({Topic.FORECASTS, Topic.STATUS})):
-            if isinstance(recorded.entry, (ForecastSet, ServiceStatus)):
+            if isinstance(recorded.entry, Exchanged):
+                yield TileUsed(recorded_tile(recording, recorded.entry.attached))
+            elif isinstance(recorded.entry, (ForecastSet, ServiceStatus)):
                 yield recorded.entry
 
 

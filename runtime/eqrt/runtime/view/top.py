@@ -208,7 +208,7 @@ def _head(state: State, now_s: float) -> list[Text]:
         ]
     mark, style = _MARKS[LEVELS[state.cycle.mode]]
     words = mode_words(state.cycle.mode, state.cycle.num_targets)
-    for_s = state.cycle.timestamp_s - state.watch.mode_since_s
+    for_s = state.watch.time_s - state.watch.mode_since_s
     if LEVELS[state.cycle.mode] != GOOD and not state.paused:
         words += f", for {for_s:.0f} s"
     if not state.paused and now_s - state.heard_s > _SILENT_S:
@@ -229,9 +229,10 @@ def _service_lines(state: State) -> list[Text]:
     status = state.status
     if status is None:
         return [Text("The service has said nothing about itself yet", "dim")]
-    rate = f"{len(status.latencies_s) / status.seconds:.1f} predictions/s"
+    per_s = 1.0 / status.seconds if status.seconds > 0.0 else math.nan
+    rate = f"{_number(len(status.latencies_s) * per_s, 1)} predictions/s"
     up = "".join(f" on {bus.channel}" for bus in status.buses if bus.state == "UP")
-    text = f"{status.messages / status.seconds:.0f} messages/s in{up}, {rate}"
+    text = f"{_number(status.messages * per_s, 0)} messages/s in{up}, {rate}"
     if state.latencies_s:
         p50, p99 = 1e3 * np.quantile(list(state.latencies_s), [0.5, 0.99])
         text += f", latency {p50:.1f} ms (99 % within {p99:.1f})"

@@ -84,6 +84,8 @@ class Head(msgspec.Struct, kw_only=True):
     level: str
     on_map: bool
     """Whether the map frame is that of the tile, so that lanes may be drawn."""
+    lanes: int
+    """Number of the message with the lanes around here; -1 = there is none."""
     ego: tuple[float, float, float] | None
     """x, y in m, yaw in rad, map frame; None = not known."""
     ego_speed_mps: float | None
@@ -102,16 +104,18 @@ def encode_update(
     ghosts: Ghosts,
     score: Score | None,
     stream: int,
+    time_s: float,
     mode_since_s: float,
+    lanes: int,
 ) -> bytes:
-    """One cycle. Places: position (A, 2), history (A, T, 2), ghosts (A, 3, 2), trajectories
-    (A, K, H, 2).
+    """One cycle, and when it is to be shown. Places: position (A, 2), history (A, T, 2), ghosts
+    (A, 3, 2), trajectories (A, K, H, 2).
     """
     origin = _origin(forecast)
     head = Head(
         stream=stream,
         cycle=forecast.cycle,
-        time_s=forecast.timestamp_s,
+        time_s=time_s,
         made_s=forecast.made_s,
         compute_s=forecast.compute_s,
         mode=forecast.mode.name,
@@ -119,6 +123,7 @@ def encode_update(
         mode_since_s=mode_since_s,
         level=LEVELS[forecast.mode],
         on_map=is_on_map(forecast),
+        lanes=lanes,
         ego=ego_pose(forecast),
         ego_speed_mps=_known(forecast.ego_speed_mps),
         origin=origin,
@@ -140,11 +145,11 @@ def encode_update(
     )
 
 
-def encode_status(status: ServiceStatus, *, lost_cycles: int) -> str:
-    """The service's own word, for the panels."""
+def encode_status(status: ServiceStatus, *, lost_cycles: int, shift_s: float = 0.0) -> str:
+    """The service's own word, for the panels; `shift_s`: from its clock to that of the cycles."""
     return _text(
         "status",
-        time_s=status.time_s,
+        time_s=status.time_s + shift_s,
         seconds=status.seconds,
         uptime_s=status.uptime_s,
         eqrt=status.eqrt,
@@ -224,7 +229,9 @@ def decode_update(payload: bytes) -> tuple[dict[str, Any], dict[str, Float64]]:
 
 
 def is_on_map(forecast: ForecastSet) -> bool:
-    """Whether the cycle was predicted with a tile, in its frame."""
+    """Whether the map frame is known to be that of a tile."""
+    if forecast.mode is Mode.RUN:  # also on an empty road, which no lanes were asked for
+        return True
     return bool(forecast.tile_id) and forecast.mode is not Mode.NO_POSE
 
 

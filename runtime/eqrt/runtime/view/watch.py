@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,15 +10,24 @@ from pathlib import Path
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.status import ServiceStatus
-from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.runtime.prediction.tiles import Tile, load_tile
 from eqrt.runtime.view.hindsight import Ghosts, Hindsight, Score
-from eqrt.runtime.view.updates import ego_pose, encode_lanes, encode_update, is_on_map
+from eqrt.runtime.view.updates import (
+    ego_pose,
+    encode_lanes,
+    encode_update,
+    is_on_map,
+)
 
 KEPT_S = 60.0
 KEPT_BYTES = 64 << 20
 LANES_M = 500.0
 """How far from the ego vehicle lanes are shown."""
 _LANES_STEP_M = 200.0  # how far it drives before it gets others
+BETWEEN_RUNS_S = 1.0
+"""In a file, from the end of one run of the service to the beginning of the next."""
+NO_LANES = -1
+_LEAST_STEP_S = 0.01  # between two cycles as pages are told; those of a service are farther apart
 LANES_KEPT = 10
 """As many as the page keeps (`scene.mjs`): a minute at 120 km/h."""
 
@@ -25,8 +35,16 @@ LANES_KEPT = 10
 class Watch:
     """What happened, with hindsight; a service that starts again begins another stream."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, joins_runs: bool = False) -> None:
+        """`joins_runs`: a service that starts again goes on where the one before ended, whatever
+        its clock says then: one timeline for a folder of drives.
+        """
+        self._joins_runs = joins_runs
         self.stream = 0
+        self.time_s = -math.inf
+        """Of the newest cycle, `ForecastSet.moment_s` as pages are told it; grows in a stream."""
+        self.shift_s = 0.0
+        """From the service's clock to this."""
         self._hindsight = Hindsight()
         self._last: ForecastSet | None = None
         self._mode: Mode | None = None
@@ -38,21 +56,32 @@ class Watch:
             self.stream += 1
             self._hindsight = Hindsight()
             self._mode = None
+            self._begin_again(forecast)
+        # what was measured just before the silence ended may be older than its last word
+        self.time_s = max(forecast.moment_s + self.shift_s, self.time_s + _LEAST_STEP_S)
         if forecast.mode is not self._mode:
-            self._mode, self.mode_since_s = forecast.mode, forecast.timestamp_s
+            self._mode, self.mode_since_s = forecast.mode, self.time_s
         self._last = forecast
         return self._hindsight.add(forecast), self._hindsight.score()
 
-    def update(self, forecast: ForecastSet) -> bytes:
-        """The same, as a page is told."""
+    def update(self, forecast: ForecastSet, *, lanes: int = NO_LANES) -> bytes:
+        """The same, as a page is told; `lanes`: the number of those around it."""
         ghosts, score = self.add(forecast)
         return encode_update(
             forecast,
             ghosts=ghosts,
             score=score,
             stream=self.stream,
+            time_s=self.time_s,
             mode_since_s=self.mode_since_s,
+            lanes=lanes,
         )
+
+    def _begin_again(self, forecast: ForecastSet) -> None:
+        if self._joins_runs:
+            self.shift_s = self.time_s + BETWEEN_RUNS_S - forecast.moment_s
+        else:
+            self.time_s = -math.inf
 
 
 def _started_again(last: ForecastSet, now: ForecastSet) -> bool:
@@ -100,25 +129,41 @@ class Lanes:
         self._tile = load_tile(tile) if tile else None
         self._is_fixed = tile is not None
         self._heard = ""
+        self._trouble = ""
         self._centre: tuple[float, float] | None = None
-        self.number = -1
-        """Of the newest message."""
+        self._told = 0
+        self.number = NO_LANES
+        """Of the message with the lanes around the newest cycle, counted from 0."""
         self.recent: deque[str] = deque(maxlen=LANES_KEPT)
         """Of the last minute's ways, the newest last, for whoever joins."""
 
     def hear(self, status: ServiceStatus) -> str:
         """Take the map that the service says it uses; returns what is wrong with it, or ""."""
-        if self._is_fixed or not status.tile or status.tile_id == self._heard:
+        if self._is_fixed or status.tile_id == self._heard:
+            return self._trouble
+        self._trouble = ""
+        self._take(None, status.tile_id)
+        if not status.tile:
             return ""
-        self._heard = status.tile_id
         try:
-            self._tile, self._centre = load_tile(Path(status.tile)), None
-            self.recent.clear()
+            tile = load_tile(Path(status.tile))
         except EqrtError as error:
-            return f"no lanes are shown: {error}"
-        if self._tile.info.tile_id != status.tile_id:
-            return f"{status.tile} has changed since the service read it: its lanes may differ"
-        return ""
+            self._trouble = f"no lanes are shown: {error}"
+            return self._trouble
+        self._take(tile, status.tile_id)
+        if tile.info.tile_id != status.tile_id:
+            changed = f"{status.tile} has changed since the service read it"
+            self._trouble = f"{changed}: its lanes may differ"
+        return self._trouble
+
+    def use(self, tile: Tile | None) -> None:
+        """Take the map that a recording has with it."""
+        if not self._is_fixed:
+            self._take(tile, tile.info.tile_id if tile else "")
+
+    def _take(self, tile: Tile | None, tile_id: str) -> None:
+        self._tile, self._heard = tile, tile_id
+        self._centre, self.number = None, NO_LANES
 
     def near(self, forecast: ForecastSet) -> str | None:
         """What to tell, if it is something new."""
@@ -130,7 +175,7 @@ class Lanes:
         ):
             return None
         self._centre = position
-        self.number += 1
+        self.number, self._told = self._told, self._told + 1
         told = encode_lanes(self._tile, centre=position, radius_m=LANES_M, number=self.number)
         self.recent.append(told)
         return told

@@ -30,10 +30,10 @@ MODE_WORDS = {
     Mode.SILENT: "No input from the sensor: earlier predictions are void",
 }
 AGENT_WORDS = {
-    Mode.RUN: "by the model, from a full history",
-    Mode.PARTIAL: "from a short history",
-    Mode.LATE: "at constant turn rate and speed: no time for the model",
-    Mode.FALLBACK: "at constant turn rate and speed: the model failed",
+    Mode.RUN: "predicted by the model, from a full history",
+    Mode.PARTIAL: "predicted from a short history",
+    Mode.LATE: "predicted at constant turn rate and speed: no time for the model",
+    Mode.FALLBACK: "predicted at constant turn rate and speed: the model failed",
 }
 AGENT_STANDS = "not predicted: nothing tells how it moves"
 """Of a target that physics leaves where it was seen (`ForecastSet.is_standstill_assumed`)."""

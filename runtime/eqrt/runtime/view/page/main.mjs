@@ -6,7 +6,7 @@ import { Scene, egoAt } from "./scene.mjs";
 import { showSigns } from "./signs.mjs";
 import { openStream } from "./stream.mjs";
 import { FileTimeline, LiveTimeline } from "./timeline.mjs";
-import { decodeLanes, decodeUpdate } from "./update.mjs";
+import { UNKNOWN, decodeLanes, decodeUpdate } from "./update.mjs";
 
 const PANELS_MS = 250;
 const KEPT_STATUSES = 70;
@@ -26,6 +26,7 @@ const page = {
   moment: null,
   selected: null,
   yaw: null,
+  before: null, // the cycle of the picture before
   words: "",
   frames: 0,
   scriptMs: [],
@@ -84,6 +85,10 @@ function greet(message) {
     page.trouble = "";
     scene.laneSets = [];
     by("speed").hidden = !ofFile;
+    by("speed").value = "1";
+    page.before = page.selected = null;
+    page.yaw = null; // perhaps it knows no ego vehicle, and is somewhere else
+    camera.placed = false;
   }
   page.hello = message;
   set("live", message.mode === "file" ? "To end" : "Live");
@@ -99,7 +104,10 @@ function picture() {
   const now = began / 1000;
   page.moment = page.timeline.moment(now, Math.min(0.1, now - last));
   last = now;
-  if (page.moment) aim(page.moment);
+  if (page.moment) {
+    notice(page.moment.cycle);
+    aim(page.moment);
+  }
   const time = page.moment?.cycle.time_s ?? 0;
   scene.draw(page.moment, camera, page.selected, (back) => page.timeline.near(time - back));
   page.frames += 1;
@@ -112,26 +120,36 @@ function remember(list, value) {
   if (list.length > 600) list.shift();
 }
 
+/** A service that starts again numbers its tracks anew: who was selected is another one now. */
+function notice(cycle) {
+  const before = page.before ?? cycle;
+  page.before = cycle;
+  const another = cycle.stream !== before.stream && cycle.cycle <= before.cycle;
+  if (another && page.selected !== null) select(null); // else it was given another model
+}
+
 /** Where the camera looks at this moment. */
 function aim(moment) {
   const ego = egoAt(moment);
   if (ego) page.yaw = ego[2];
   let at = ego;
   const row = moment.cycle.rows.get(page.selected);
-  if (camera.follow === "selected" && row !== undefined) at = agentPlace(moment, row);
+  if (camera.follow === "selected" && row !== undefined) at = agentPlace(moment, row) ?? at;
   if (!at && camera.follow === "ego") at = traffic(moment.cycle);
   camera.placed = Boolean(at) || camera.placed;
   const [x, y] = at ?? [camera.x, camera.y];
   camera.lookAt(x, y, page.yaw);
 }
 
+/** An agent's place at a moment, [x, y], or null where it is too far away to be told. */
 function agentPlace({ cycle, next, part }, row) {
   const place = (of, at) => [
     of.origin[0] + of.position[2 * at] * of.step_m, of.origin[1] + of.position[2 * at + 1] * of.step_m,
   ];
+  if (cycle.position[2 * row] === UNKNOWN) return null;
   const [x, y] = place(cycle, row);
   const later = next?.rows.get(cycle.agents.track_id[row]);
-  if (later === undefined) return [x, y];
+  if (later === undefined || next.position[2 * later] === UNKNOWN) return [x, y];
   const [nx, ny] = place(next, later);
   return [x + part * (nx - x), y + part * (ny - y)];
 }
@@ -149,11 +167,11 @@ function traffic(cycle) {
 function panels() {
   const { timeline, moment } = page;
   const now = seconds();
-  const silent = timeline.mode === "live" && timeline.live && !timeline.empty ? now - timeline.arrived : 0;
-  const stopped = page.lost || silent > STALE_S;
+  const silent = silence(timeline, moment, now);
+  const stopped = page.lost || (timeline.mode === "live" && silent > STALE_S);
   page.words = showBanner({
     lost: page.lost, hello: page.hello, moment, silent,
-    status: page.statuses.at(-1), waiting: now - page.opened,
+    status: statusAt(moment?.time), waiting: now - page.opened,
   });
   showService(page.statuses, moment, timeline.mode, page.trouble ? [page.trouble] : [], scene.colours);
   showScore(moment?.cycle.score ?? null);
@@ -161,6 +179,20 @@ function panels() {
   showTransport(timeline, stopped ? now - timeline.arrived : 0);
   sayTurn();
   sayFollow();
+}
+
+/** What the service said of the second of a moment, else before it, else first. */
+function statusAt(time = Infinity) {
+  const after = page.statuses.findIndex((status) => status.time_s >= time);
+  if (after < 0) return page.statuses.at(-1);
+  const { time_s: said, seconds: period } = page.statuses[after];
+  return said - period <= time ? page.statuses[after] : page.statuses[Math.max(0, after - 1)];
+}
+
+/** For how long nothing has come that should, or stands in a file, s. */
+function silence(timeline, moment, now) {
+  if (timeline.mode === "file") return moment ? moment.time - moment.cycle.time_s : 0;
+  return timeline.live && !timeline.empty ? now - timeline.arrived : 0;
 }
 
 /** `stopped`: for how long nothing has come that should, s; 0 if all is well. */
@@ -222,7 +254,8 @@ const keys = {
 };
 
 function sayTurn() {
-  const words = { up: "Heading up", right: "Heading right", north: "North up" };
+  const still = page.moment?.cycle.on_map ? "North up" : "Not turning";
+  const words = { up: "Heading up", right: "Heading right", north: still };
   set("turn", page.yaw === null ? words.north : words[camera.axis]);
   by("turn").disabled = page.yaw === null;
 }
@@ -356,6 +389,7 @@ window.eqrt = {
   get ghosts() { return page.moment ? page.moment.cycle.ghosts.filter((v) => v !== -32768).length / 2 : 0; },
   get score() { return page.moment?.cycle.score ?? null; },
   get lanes() { return scene.lanesDrawn; },
+  get north() { return scene.north; },
   get labels() { return scene.labels.boxes ?? []; },
   get pixels() { return scene.agents.map(({ id, px, py }) => ({ id, px, py })); },
   get camera() { return { scale: camera.scale, follow: camera.follow, axis: camera.axis }; },

@@ -1,6 +1,7 @@
 // Everything beside the picture, in words and numbers.
 
 import { drawHistogram, drawSpark } from "./charts.mjs";
+import { isPredicted } from "./update.mjs";
 
 const MARKS = { good: "✓", limited: "!", bad: "✕", lost: "✕", waiting: "…" };
 export const STALE_S = 2;
@@ -19,7 +20,8 @@ export function showBanner({ lost, hello, moment, status, silent, waiting }) {
     [level, words] = [cycle.level, cycle.mode_words];
     if (cycle.level !== "good" && lasts >= 1) since = `, for ${ago(lasts)}`;
     if (silent > STALE_S) {
-      [level, words, since] = ["lost", "Nothing heard of the service", `, for ${ago(silent)}`];
+      const nothing = hello?.mode === "file" ? "Nothing is recorded here" : "Nothing heard of the service";
+      [level, words, since] = ["lost", nothing, `, for ${ago(silent)}`];
     }
   } else if (hello) {
     words = hello.mode === "file" ? `Reading ${hello.name}` : "Waiting for predictions";
@@ -152,9 +154,10 @@ export function showSelected(moment, id) {
     return false;
   }
   const { agents } = moment.cycle;
-  const size = agents.length_m[row] === null ? "not known"
+  const size = agents.length_m[row] === null && agents.width_m[row] === null ? "not known"
     : `${number(agents.length_m[row], 1, "m")} × ${number(agents.width_m[row], 1, "m")}`;
-  set("selected-how", `Predicted ${agents.words[row]}.`);
+  const how = agents.words[row];
+  set("selected-how", `${how[0].toUpperCase()}${how.slice(1)}.`);
   showNumbers("selected-numbers", [
     ["speed", number(agents.speed_mps[row], 1, "m/s")],
     ["from ego", number(agents.range_m[row], 1, "m")],
@@ -162,6 +165,7 @@ export function showSelected(moment, id) {
     ["age of measurement", `${Math.round(1000 * agents.age_s[row])} ms`],
     ["the sensor's number", `${agents.object_id[row]}`],
   ]);
+  by("selected-modes").hidden = !isPredicted(agents, row);
   showModes(agents.probabilities[row]);
   showErrors(agents, row);
   return true;

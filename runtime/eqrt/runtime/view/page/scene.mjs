@@ -2,7 +2,7 @@
 
 import { FADES, addTrajectory, layerOf } from "./layers.mjs";
 import { Labels } from "./labels.mjs";
-import { UNKNOWN } from "./update.mjs";
+import { UNKNOWN, isPredicted } from "./update.mjs";
 
 const LANE_M = 3.3;
 const SIZES = { // metres, where the sensor tells none: drawn dashed
@@ -12,7 +12,7 @@ const SIZES = { // metres, where the sensor tells none: drawn dashed
 const DOT_M = 1; // radius of an object of which neither size nor class is known
 const EGO_M = [4.6, 1.9];
 const LEAST_PX = 5; // nobody is drawn smaller
-const LANES_KEPT = 10; // a minute at 120 km/h
+const LANES_KEPT = 30; // as far as 150 s at 120 km/h: of a file, so much is at hand
 const TURNED_BACK = Math.PI;
 
 /** Draws moments on a canvas. */
@@ -44,17 +44,16 @@ export class Scene {
     camera.resize(clientWidth, clientHeight);
   }
 
-  /** Takes the lanes around another place; those of another map are gone. */
+  /** Takes the lanes around another place, of this map or another one. */
   addLanes(lanes) {
-    const others = this.laneSets.filter(({ tile, number }) => tile === lanes.tile && number !== lanes.number);
+    const others = this.laneSets.filter(({ number }) => number !== lanes.number);
     this.laneSets = [...others, lanes].slice(-LANES_KEPT);
   }
 
   /** The lanes around where a cycle was, or null. */
   lanesAt(cycle) {
     if (!cycle.on_map) return null;
-    const away = ({ origin }) => Math.hypot(origin[0] - cycle.origin[0], origin[1] - cycle.origin[1]);
-    return this.laneSets.reduce((best, one) => (!best || away(one) <= away(best) ? one : best), null);
+    return this.laneSets.find(({ number }) => number === cycle.lanes) ?? null;
   }
 
   /** Draws one moment; `selected` is a track id or null. `past(s)` is the cycle s seconds before. */
@@ -79,7 +78,7 @@ export class Scene {
     this.#drawAgents(cycle, camera, selected);
     this.#drawEgo(moment, camera);
     this.labels.draw(context, this.agents, { cycle, camera, colours, selected, keepFree: this.ego });
-    this.#drawScale(camera);
+    this.#drawScale(camera, cycle.on_map);
   }
 
   /** The agent at a pixel, or null. */
@@ -210,6 +209,7 @@ export class Scene {
       const then = past(seconds);
       const before = then?.rows.get(cycle.agents.track_id[row]);
       if (before === undefined || then.stream !== cycle.stream) continue;
+      if (Math.abs(cycle.time_s - then.time_s - seconds) > 0.2) continue; // there was a gap
       const path = new Path2D();
       addTrajectory(path, then, before, 0, 1);
       const moved = new Path2D();
@@ -222,7 +222,7 @@ export class Scene {
 
   /** Circles as wide as predictions were wrong in the last minute, after 1, 2 and 3 s. */
   #drawUsualError(cycle, row, scale) {
-    if (!cycle.score || cycle.agents.ellipses) return;
+    if (!cycle.score || cycle.agents.ellipses || !isPredicted(cycle.agents, row)) return;
     const { context, colours } = this;
     const [, , modes, horizon] = cycle.shape;
     context.strokeStyle = colours.ahead;
@@ -365,8 +365,8 @@ export class Scene {
     context.stroke();
   }
 
-  /** A bar of a round length, and where north is. */
-  #drawScale(camera) {
+  /** A bar of a round length, and where north is: that is known on a map. */
+  #drawScale(camera, onMap) {
     const { context, colours, canvas } = this;
     const metres = [1, 2, 5, 10, 20, 50, 100, 200].find((m) => m * camera.scale >= 60) ?? 500;
     const [x, y] = [14, canvas.height / this.ratio - 16];
@@ -383,7 +383,8 @@ export class Scene {
     context.textAlign = "left";
     context.textBaseline = "alphabetic";
     context.fillText(`${metres} m`, x + 4, y - 6);
-    this.#drawNorth(x + metres * camera.scale + 26, y - 8, camera);
+    this.north = onMap;
+    if (onMap) this.#drawNorth(x + metres * camera.scale + 26, y - 8, camera);
   }
 
   #drawNorth(x, y, camera) {

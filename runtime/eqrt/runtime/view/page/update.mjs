@@ -24,6 +24,9 @@ export function decodeUpdate(buffer) {
   return cycle;
 }
 
+/** Whether anything tells how an agent moves: without, its paths stay where it is and say nothing. */
+export function isPredicted(agents, row) { return agents.speed_mps[row] !== null; }
+
 /** Lanes as arrays of metres from `origin`, with the box around each. */
 export function decodeLanes(message) {
   const lanes = message.lanes.map((centimetres) => {
