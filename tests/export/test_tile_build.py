@@ -335,6 +335,17 @@ def test_broken_lanelets_are_left_out_and_named(write: Write) -> None:
     ]
 
 
+def test_a_lanelet_without_length_is_left_out_and_named(write: Write) -> None:
+    """Both of its bounds lead back to where they begin."""
+    ways = (
+        '<way id="15"><nd ref="1"/><nd ref="1"/></way><way id="16"><nd ref="3"/><nd ref="3"/></way>'
+    )
+    text = osm(LOCAL, *ROAD, lanelet(23, 15, 16)).replace("<relation", ways + "<relation", 1)
+    lane_map, _, skipped = build(write(text))
+    assert lane_map.lane_id.tolist() == [21, 22]
+    assert skipped == ["lane 23 is shorter than a centimetre"]
+
+
 def test_a_commonroad_scenario_becomes_a_tile_with_its_credit() -> None:
     lane_map, info, _ = build(US101, (34.138, -118.364))
     assert lane_map.num_lanes == 18
@@ -395,6 +406,29 @@ def test_the_command_builds_a_tile_that_loads(
     assert "latitude 49.0000000, longitude 8.4200000" in printed
     assert "FZI, BSD-3" in printed
     assert load_tile(out).info.tile_id in printed
+
+
+def test_the_command_names_what_it_left_out(
+    write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shapeless = [
+        f'<relation id="{n}"><tag k="type" v="lanelet"/></relation>' for n in range(51, 76)
+    ]
+    path = write(osm(LOCAL, *ROAD, *shapeless))
+    assert main(["tile", "build", str(path), "--out", str(tmp_path / "a.tile")]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "note: 25 parts of the map were left out:"
+    assert said[1] == "  lanelet 51 has 0 left bounds, expected one"
+    assert said[20:] == ["  lanelet 70 has 0 left bounds, expected one", "  and 5 more"]
+
+
+def test_a_map_is_not_overwritten_by_its_tile(
+    write: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(osm(LOCAL, *ROAD))
+    assert main(["tile", "build", str(path), "--out", str(path)]) == 2
+    assert f"--out {path} is the map itself" in capsys.readouterr().err
+    assert path.read_text() == osm(LOCAL, *ROAD)
 
 
 def test_a_failed_build_leaves_the_old_tile(

@@ -20,7 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import TileError, UsageError
-from eqrt.core.lanes import Lane, LaneMap, LaneType, build_lane_map, middle_line
+from eqrt.core.lanes import (
+    SHORTEST_M,
+    Lane,
+    LaneMap,
+    LaneType,
+    arclength,
+    build_lane_map,
+    middle_line,
+)
 from eqrt.core.tile import TileInfo, decode, encode
 from eqrt.export.osm import keep_lanelets, read_osm, tag_value
 from eqrt.training.recordings.commonroad import lane_map as commonroad_lane_map
@@ -100,8 +108,14 @@ def _from_lanelet2(source: Path, origin: Origin | None) -> _Built:
     )
     skipped += _drop_odd_limits(lanelets, rules)
     graph = lanelet2.routing.RoutingGraph(lanelets, rules)
-    lanes = build_lane_map(_lanes(lanelets, graph, rules, source), str(source))
-    return _Built(lanes, origin if planar else projected_from, "", skipped)
+    lanes = []
+    for lane in _lanes(lanelets, graph, rules, source):
+        if arclength(lane.centerline)[-1] < SHORTEST_M:
+            skipped.append(f"lane {lane.lane_id} is shorter than a centimetre")
+        else:
+            lanes.append(lane)
+    lane_map = build_lane_map(lanes, str(source))
+    return _Built(lane_map, origin if planar else projected_from, "", skipped)
 
 
 def _import_lanelet2() -> Any:

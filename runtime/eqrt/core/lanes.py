@@ -23,6 +23,8 @@ SPACING_M = 2.0
 MAX_COORDINATE_M = 131_072.0
 """float32 resolves 8 mm out to here; a map farther from its origin is refused."""
 MAX_SPEED_LIMIT_MPS = 1e3
+SHORTEST_M = 0.01
+"""A lane shorter than this leads nowhere."""
 NO_LANE = -1
 """`left` or `right` where there is no neighbour."""
 
@@ -163,7 +165,7 @@ def _check(lane: Lane, where: str) -> None:
             "the map's origin (or is not finite); choose an origin within the map, or shift x and "
             "y where the map itself states them"
         )
-    if len(lane.centerline) < 2 or arclength(lane.centerline)[-1] < 0.01:
+    if len(lane.centerline) < 2 or arclength(lane.centerline)[-1] < SHORTEST_M:
         raise TileError(f"{where}: lane {lane.lane_id} is shorter than 1 cm; repair the map")
     if lane.speed_limit_mps < 0.0 or lane.speed_limit_mps > MAX_SPEED_LIMIT_MPS:  # False for NaN
         raise TileError(

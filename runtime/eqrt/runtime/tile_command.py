@@ -20,6 +20,8 @@ from eqrt.core.lane_lines import LaneLines
 from eqrt.core.tile import TileInfo
 from eqrt.runtime.prediction.tiles import Tile, load_tile, save_tile
 
+_MOST_NAMED = 20
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """`info FILE` and `build SOURCE --out FILE`."""
@@ -50,15 +52,22 @@ def run(args: argparse.Namespace) -> int:
     """Print what the tile holds, after building it if asked to."""
     path: Path = args.tile if args.action == "info" else args.out
     if args.action == "build":
+        if path.resolve() == args.source.resolve():
+            raise UsageError(f"--out {path} is the map itself; choose another file for the tile")
         data, skipped = _workshop().build_tile(args.source, args.origin, args.credit)
         if skipped:
-            print(
-                f"note: {len(skipped)} parts of the map were left out, first: {skipped[0]}",
-                file=sys.stderr,
-            )
+            _note(skipped)
         save_tile(path, data)
     print(_describe(load_tile(path)))
     return 0
+
+
+def _note(skipped: list[str]) -> None:
+    """What the map has and the tile has not, the first of it by name."""
+    lines = [f"note: {len(skipped)} parts of the map were left out:", *skipped[:_MOST_NAMED]]
+    if len(skipped) > _MOST_NAMED:
+        lines.append(f"and {len(skipped) - _MOST_NAMED} more")
+    print("\n  ".join(lines), file=sys.stderr)
 
 
 def _workshop() -> ModuleType:
