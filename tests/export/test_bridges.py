@@ -391,6 +391,19 @@ def test_a_velocity_is_told_in_the_objects_own_frame(tmp_path: Path) -> None:
     assert not kinematics.initial_pose_with_covariance.covariance.any()
 
 
+@pytest.mark.parametrize("ahead", [1.0, -1.0])
+def test_a_car_that_reverses_looks_where_it_looked(tmp_path: Path, ahead: float) -> None:
+    """North, or backwards; not round by 180 degrees at the first step."""
+    still = one_car()
+    steps = np.arange(1, still.trajectories.shape[2] + 1)
+    path = np.broadcast_to(still.position[:, None, None], still.trajectories.shape).copy()
+    path[..., 1] += ahead * 0.2 * steps
+    (message,) = objects_of(tmp_path, replace(still, trajectories=path))
+    poses = message.objects[0].kinematics.predicted_paths[0].path
+    assert ahead * (poses[-1].position.y - poses[0].position.y) > 5.0
+    assert [math.sin(yaw_of(pose)) for pose in poses] == pytest.approx([1.0] * len(poses))
+
+
 def test_a_velocity_that_is_not_known_can_be_told_from_standing(tmp_path: Path) -> None:
     """Both are 0, and only one of them is said to be measured; so are headings."""
     stands = replace(one_car(), velocity=np.zeros((1, 2)))

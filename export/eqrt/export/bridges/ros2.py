@@ -148,7 +148,7 @@ class _Objects:
             [
                 self._new(
                     "PredictedPath",
-                    self._poses(path, yaw_rad),
+                    self._poses(path, course_rad),
                     self._new("builtin_interfaces/Duration", step // 10**9, step % 10**9),
                     float(probability),
                 )
@@ -167,13 +167,20 @@ class _Objects:
         variance = np.zeros(36) if known else _UNKNOWN.copy()
         return self._new("geometry_msgs/TwistWithCovariance", twist, variance)
 
-    def _poses(self, path: NDArray[np.float64], yaw_rad: float) -> list[Any]:
-        """Each looks where it came along; where it stands, as before."""
+    def _poses(self, path: NDArray[np.float64], course_rad: float) -> list[Any]:
+        """Each looks where it came along, or back there if it reverses; standing, as before.
+
+        It reverses if it looks (`course_rad`, NaN = not known) away from where it first moves.
+        """
+        yaw_rad, back_rad = 0.0 if math.isnan(course_rad) else course_rad, math.nan
         poses = []
         for step, point in enumerate(path):
             way = point - path[max(step - 1, 0)]
             if np.hypot(*way) > _STANDS_M:
-                yaw_rad = math.atan2(way[1], way[0])
+                along_rad = math.atan2(way[1], way[0])
+                if math.isnan(back_rad):
+                    back_rad = math.pi if math.cos(along_rad - course_rad) < 0.0 else 0.0
+                yaw_rad = along_rad + back_rad
             poses.append(self._pose(point, yaw_rad))
         return poses
 
