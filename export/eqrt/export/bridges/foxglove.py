@@ -52,6 +52,7 @@ _PROTOBUF: dict[str, Any] = {
     "/tf": FrameTransform,
     "/log": Log,
 }
+Rgb = tuple[float, float, float]
 _GREY, _BLUE, _ORANGE = (0.55, 0.55, 0.55), (0.20, 0.55, 0.95), (0.95, 0.55, 0.10)
 _USUAL = (Mode.RUN, Mode.NO_MAP, Mode.PARTIAL)
 
@@ -158,21 +159,7 @@ def _entity(
     seen = forecasts.history[row][forecasts.history_valid[row]]
     modes = zip(forecasts.trajectories[row], forecasts.probabilities[row].tolist(), strict=True)
     start = forecasts.position[row][None]
-    length_m, width_m = size.tolist()
-    place, colour_of_it = Vector3(x=x, y=y, z=HEIGHT_M / 2), _color(colour, 0.6)
-    boxes, cylinders = [], []
-    if math.isnan(heading_rad):
-        upright = Pose(position=place, orientation=_turned(0.0))
-        across = Vector3(x=width_m, y=width_m, z=HEIGHT_M)
-        cylinders = [
-            CylinderPrimitive(
-                pose=upright, size=across, bottom_scale=1.0, top_scale=1.0, color=colour_of_it
-            )
-        ]
-    else:
-        turned = Pose(position=place, orientation=_turned(heading_rad))
-        extent = Vector3(x=length_m, y=width_m, z=HEIGHT_M)
-        boxes = [CubePrimitive(pose=turned, size=extent, color=colour_of_it)]
+    boxes, cylinders = _body(Vector3(x=x, y=y, z=HEIGHT_M / 2), heading_rad, size, colour)
     label = TextPrimitive(
         pose=Pose(position=Vector3(x=x, y=y, z=HEIGHT_M + 1.0)),
         billboard=True,
@@ -195,6 +182,24 @@ def _entity(
         lines=[_line(seen, _color(_GREY, 0.8), 0.15), *paths],
         texts=[label],
     )
+
+
+def _body(
+    place: Vector3, heading_rad: float, size: NDArray[np.float64], colour: Rgb
+) -> tuple[list[CubePrimitive], list[CylinderPrimitive]]:
+    """A box that is turned, or a cylinder as wide as it where no heading is known (NaN)."""
+    length_m, width_m = size.tolist()
+    color = _color(colour, 0.6)
+    if math.isnan(heading_rad):
+        pose = Pose(position=place, orientation=_turned(0.0))
+        extent = Vector3(x=width_m, y=width_m, z=HEIGHT_M)
+        upright = CylinderPrimitive(
+            pose=pose, size=extent, bottom_scale=1.0, top_scale=1.0, color=color
+        )
+        return [], [upright]
+    pose = Pose(position=place, orientation=_turned(heading_rad))
+    extent = Vector3(x=length_m, y=width_m, z=HEIGHT_M)
+    return [CubePrimitive(pose=pose, size=extent, color=color)], []
 
 
 def _lanes(moment: Moment) -> SceneUpdate:
@@ -231,7 +236,7 @@ def _log(moment: Moment, status: ServiceStatus) -> Log:
     )
 
 
-def _color(rgb: tuple[float, float, float], alpha: float) -> Color:
+def _color(rgb: Rgb, alpha: float) -> Color:
     return Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 

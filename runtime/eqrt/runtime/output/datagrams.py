@@ -225,17 +225,8 @@ def _forecasts(wire: _Wire) -> ForecastSet:
     """Raises ValueError if the arrays have not the shape that the map says, or a mode is new, or
     there is a number that no service says.
     """
+    _check(wire)
     agents, steps, num_modes, horizon = wire.shape
-    least = (0, 0, 1, 1)
-    if not all(low <= n <= _MAX_UDP_BYTES for low, n in zip(least, wire.shape, strict=True)):
-        raise ValueError(f"not a datagram of eqrt (shape {wire.shape})")
-    if not 0 <= wire.part < wire.parts:
-        raise ValueError(f"not a datagram of eqrt (part {wire.part} of {wire.parts})")
-    times_s = (wire.timestamp_s, wire.made_s, wire.compute_s, wire.dt_s)
-    if not (all(map(math.isfinite, times_s)) and wire.dt_s > 0.0):
-        raise ValueError(f"not a datagram of eqrt (times {times_s})")
-    for number in set(wire.agent_mode):
-        Mode(number)
     covariances = None
     if wire.covariances:
         covariances = _array(wire.covariances, agents, num_modes, horizon, 2, 2)
@@ -267,6 +258,19 @@ def _forecasts(wire: _Wire) -> ForecastSet:
         probabilities=_array(wire.probabilities, agents, num_modes),
         covariances=covariances,
     )
+
+
+def _check(wire: _Wire) -> None:
+    least = (0, 0, 1, 1)
+    if not all(low <= n <= _MAX_UDP_BYTES for low, n in zip(least, wire.shape, strict=True)):
+        raise ValueError(f"not a datagram of eqrt (shape {wire.shape})")
+    if not 0 <= wire.part < wire.parts:
+        raise ValueError(f"not a datagram of eqrt (part {wire.part} of {wire.parts})")
+    times_s = (wire.timestamp_s, wire.made_s, wire.compute_s, wire.dt_s)
+    if not (all(map(math.isfinite, times_s)) and wire.dt_s > 0.0):
+        raise ValueError(f"not a datagram of eqrt (times {times_s})")
+    for number in set(wire.agent_mode):
+        Mode(number)
 
 
 def _bytes(values: NDArray[np.float64]) -> bytes:
