@@ -126,9 +126,8 @@ def test_the_last_value_that_may_be_is_taken(changes: dict[str, list[float]]) ->
 )
 def test_a_tile_may_have_so_many_points_and_successors(most: LaneMap, more: LaneMap) -> None:
     decode(encode(most, INFO), "a.tile")
-    with pytest.raises(
-        TileError, match=r"^here: .* its size is beyond what a tile may be \(4,194,304 points"
-    ):
+    fault = r"its size is beyond what a tile may be \(4,194,304 points, 65,536 bytes of text\);"
+    with pytest.raises(TileError, match=rf"^here: .* {fault}"):
         encode(more, INFO)
 
 
