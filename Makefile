@@ -13,7 +13,8 @@ FUZZ_JOBS ?= 1
 FUZZ_TARGETS ?=
 MUTATION_MODULES ?=
 MUTATION_JOBS ?= 1
-PYTEST_ARGS ?= -n 2 --dist loadfile
+# Many tests wait for something: three at a time keep two cores busy.
+PYTEST_ARGS ?= -n 3 --dist loadfile
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-runtime lint docs cli-reference conformance conformance-table fuzz mutation coverage bench figures systems-table view-figures view-picture faults soak load under-load recording-cost clean
