@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import re
 import subprocess
 import sys
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +111,21 @@ def test_the_last_cycle_counts_although_the_log_ends_in_it() -> None:
     last = list(replay(pipeline, list(traffic(cars, 0.3))[:-1]))[-1]
     assert last.timestamp_s == pytest.approx(0.3)
     assert last.num_targets == 2
+
+
+def test_messages_whose_stamps_are_no_times_change_nothing() -> None:
+    cars = [Car(object_id=1, x_m=20.0, y_m=0.0), Car(object_id=2, x_m=30.0, y_m=3.0)]
+
+    def told(odd: list[float]) -> list[bytes]:
+        messages = list(traffic(cars, 2.5))
+        for number, stamp in enumerate(odd):
+            strange = copy(messages[40 * number])
+            strange.timestamp = stamp
+            messages.insert(40 * number + 20, strange)
+        pipeline = Pipeline(load_profile("generic"), shipped_predictor())
+        return [json_lines(made) for made in replay(pipeline, messages)]
+
+    assert told([math.nan, math.inf, -math.inf]) == told([]) != []
 
 
 def test_a_replay_ends_with_a_line_about_it(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import sys
 import time
@@ -283,9 +284,14 @@ class _RecordingReplay:
 
 
 def replay(pipeline: Pipeline, messages: Iterable[can.Message]) -> Iterator[ForecastSet]:
-    """Every prediction the service would have made, on the clock of the messages' stamps."""
+    """Every prediction the service would have made, on the clock of the messages' stamps.
+
+    A message whose stamp is no time (NaN, infinite) is left out; no log reader passes one on.
+    """
     now_s = None
     for message in messages:
+        if not math.isfinite(message.timestamp):
+            continue
         now_s = message.timestamp
         yield from pipeline.poll(now_s)
         yield from pipeline.feed(message, now_s)
