@@ -123,7 +123,8 @@ def decode_datagram(payload: bytes) -> Datagram | ServiceStatus:
         raise ValueError(f"not a datagram of eqrt ({in_one_line(error)})") from error
     if isinstance(wire, _StatusWire):
         return wire.status
-    return Datagram(wire.part, wire.parts, _forecasts(wire))
+    with np.errstate(invalid="ignore", over="ignore"):  # a stranger may send any numbers
+        return Datagram(wire.part, wire.parts, _forecasts(wire))
 
 
 class _Version(msgspec.Struct):
