@@ -59,7 +59,7 @@ def _export(model: nn.Module, contract: ModelContract) -> onnx.ModelProto:
             output_names=list(contract.outputs),
             dynamic_shapes=tuple({0: batch} for _ in example),
             external_data=False,
-            optimize=False,  # it would be done twice, with the same result
+            optimize=False,  # done below, with limits that fold more
             verbose=False,
         )
     if program is None:
