@@ -58,6 +58,7 @@ ENVIRONMENT = Environment(
     numpy="2.0.0",
     onnxruntime="1.20.0",
     eqrt="0.1.0",
+    cooling=1.5,
 )
 
 

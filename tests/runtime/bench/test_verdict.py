@@ -103,3 +103,13 @@ def test_missed_deadlines_faults_growth_and_the_governor_are_pointed_out() -> No
         "the frequency governor is 'powersave': performance is steadier",
         "no AVX2 here: onnxruntime is several times slower without",
     ]
+
+
+def test_caches_that_others_use_are_pointed_out_where_runs_wait() -> None:
+    shared, periodic = {"cooling": 38.2}, {"schedule": "periodic", "rate_hz": 10.0}
+    assert "a sum of 16 KiB takes 38 x as long" in given(
+        [MS] * 6636, settings=periodic, environment=shared
+    )
+    assert given([MS] * 6636, environment=shared) == ""
+    for own in (1.5, None):
+        assert given([MS] * 6636, settings=periodic, environment={"cooling": own}) == ""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from eqrt.core.errors import UsageError
+from eqrt.runtime.bench.cooling import cooling
 
 _FLAGS = re.compile(r"(avx2|fma|f16c|avx512\w*|avx_vnni|amx\w*|asimd\w*|sve\w*|i8mm|bf16)")
 _CPU = Path("/sys/devices/system/cpu")
@@ -34,6 +35,8 @@ class Environment:
     numpy: str
     onnxruntime: str
     eqrt: str
+    cooling: float | None = None
+    """`eqrt.runtime.bench.cooling`; None in a report from before it was measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,6 +71,7 @@ def read_environment() -> Environment:
         numpy=importlib.metadata.version("numpy"),
         onnxruntime=importlib.metadata.version("onnxruntime"),
         eqrt=importlib.metadata.version("eqrt"),
+        cooling=cooling(),
     )
 
 

@@ -151,6 +151,8 @@ def _facts(report: Report) -> Iterator[Sequence[str]]:
     yield "cores", f"{cores} of {environment.cores_present}"
     yield "governor", environment.governor or "not known"
     yield "virtual machine", "yes" if environment.hypervisor else "no"
+    if environment.cooling is not None:
+        yield "16 KiB after 30 ms", f"{environment.cooling:g} x as long"
     yield "kernel", environment.kernel
     for name in ("eqrt", "python", "numpy", "onnxruntime"):
         yield name, getattr(environment, name)

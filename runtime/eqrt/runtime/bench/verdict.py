@@ -24,6 +24,7 @@ _SHORTER = 0.98  # of the time asked for: the last tick may be nearly a period b
 _LONG_TAIL = 3.0
 _SLOW_WAKE_UP_NS = 1_000_000
 _LEAK_KIB_PER_S = 10.0
+_COLD = 5.0  # times; a wait evicts little by itself
 _WASTED_CPU = 1.2  # CPU time per time taken, with several threads
 _WORTH_THREADS = 1.1  # times as fast as one
 
@@ -56,6 +57,7 @@ def advice(
         *_wake_up(judged, punctuality),
         *_memory(resources),
         *_machine(environment, resources),
+        *_caches(settings, environment),
     )
 
 
@@ -178,3 +180,14 @@ def _machine(environment: Environment, resources: Resources) -> Iterator[str]:
         yield f"the frequency governor is {environment.governor!r}: performance is steadier"
     if "avx2" not in environment.flags and not any("asimd" in f for f in environment.flags):
         yield "no AVX2 here: onnxruntime is several times slower without"
+
+
+def _caches(settings: Settings, environment: Environment) -> Iterator[str]:
+    """Back-to-back runs hardly wait, and find what the one before left."""
+    cooling = environment.cooling
+    if settings.rate_hz is not None and cooling is not None and cooling > _COLD:
+        yield (
+            f"after 30 ms of waiting, caches are cold: a sum of 16 KiB takes {cooling:.0f} x as "
+            "long. Others use them: programs, or guests of the same host; elsewhere a run at "
+            f"{settings.rate_hz:g} Hz may be much quicker"
+        )
