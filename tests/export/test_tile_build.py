@@ -477,3 +477,12 @@ def test_without_lanelet2_the_command_says_what_to_install(tmp_path: Path) -> No
         "eqrt: reading Lanelet2 maps needs the package 'lanelet2', which is not installed; "
         "install it with: pip install 'eqrt[maps]'"
     ]
+
+
+@pytest.mark.parametrize("name", ["Town.OSM.GZ", "Town.Osm.gz"])
+def test_a_file_may_be_named_in_capitals(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(TOWN10HD.read_bytes())
+    data, _ = build_tile(path, None, None)
+    _, info = decode(data, name)
+    assert (info.name, info.source) == ("Town", name)

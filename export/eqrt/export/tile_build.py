@@ -49,10 +49,10 @@ def build_tile(source: Path, origin: Origin | None, credit: str | None) -> tuple
     not known. Raises TileError or LogError naming the file if it cannot be used, UsageError if
     `lanelet2` is not installed.
     """
-    plain = source.name.removesuffix(".gz")
-    if plain.endswith(".osm"):
+    name, kind = _name_and_kind(source)
+    if kind == ".osm":
         built = _from_lanelet2(source, origin)
-    elif plain.endswith(".xml"):
+    elif kind == ".xml":
         built = _from_commonroad(source, origin)
     else:
         raise TileError(
@@ -61,7 +61,7 @@ def build_tile(source: Path, origin: Origin | None, credit: str | None) -> tuple
         )
     latitude_deg, longitude_deg = built.origin or (math.nan, math.nan)
     info = TileInfo(
-        name=plain.rpartition(".")[0],
+        name=name,
         source=source.name,
         credit=built.credit if credit is None else credit,
         origin_latitude_deg=latitude_deg,
@@ -70,6 +70,12 @@ def build_tile(source: Path, origin: Origin | None, credit: str | None) -> tuple
     data = encode(built.lane_map, info)
     decode(data, str(source))  # a file that has not been read back is not finished
     return data, built.skipped
+
+
+def _name_and_kind(source: Path) -> tuple[str, str]:
+    """`maps/Town.OSM.gz` -> `Town`, `.osm`."""
+    plain = Path(source.name[:-3] if source.name.lower().endswith(".gz") else source.name)
+    return plain.stem, plain.suffix.lower()
 
 
 @dataclass(frozen=True, slots=True)
