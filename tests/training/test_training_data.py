@@ -13,6 +13,7 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.training.configuration import DataConfig
 from eqrt.training.dataset.windows import MIN_DRIVE_M
+from eqrt.training.tables import fill
 from eqrt.training.training_data import TrainingData, open_training_data
 from tiny_training import DATA, tiny
 from window_samples import packed_scenes
@@ -55,6 +56,22 @@ def test_weights_tell_targets_driving_and_standing_windows_apart(scenes: Path) -
     assert np.array_equal(pool.weights == 3.0, windows.focal)
     assert np.array_equal(pool.weights == 2.0, drives & ~windows.focal)
     assert pool.samples_per_epoch == round(pool.weights.sum())
+
+
+def test_windows_that_are_not_whole_are_drawn_less_often(scenes: Path) -> None:
+    everything = DataConfig(stride=6, held_out=("1",), focal_weight=3.0, standing_weight=0.5)
+    as_they_are = opened(scenes, everything).pool
+    pool = opened(scenes, replace(everything, partial_share=0.2)).pool
+    windows = pool.gather(np.arange(len(pool)))
+    whole = windows.future_valid.all(axis=1) & (windows.history_valid[:, 0].sum(axis=1) > 10)
+    assert 0 < whole.sum() < len(whole)
+    assert np.allclose(pool.weights, as_they_are.weights * np.where(whole, 1.0, 0.2))
+
+
+def test_a_share_of_nothing_is_refused() -> None:
+    """Windows that are never drawn need not be read at all: `targets` chooses."""
+    with pytest.raises(ValueError, match="partial_share"):
+        fill(DataConfig, {"partial_share": 0.0}, "data")
 
 
 def test_a_share_of_the_recordings_is_trained_on_and_all_that_are_held_out_measure(

@@ -45,6 +45,10 @@ class DataConfig:
     """Likewise one of another target that moves MIN_DRIVE_M or more while it is seen."""
     standing_weight: NotNegative = 1.0
     """Likewise all the rest. Most of recorded traffic is parked, and easy."""
+    partial_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
+    """Of these, so much for a window whose target is not seen to the end of the horizon, or for no
+    more than half of its history. Models are measured on whole windows, and their last steps, the
+    hardest, are learned from windows that have them."""
 
     def window_options(self) -> WindowOptions | None:
         """For the cutter; None = nothing is asked for."""

@@ -36,14 +36,14 @@ def best_mode_loss(
 def soft_mode_loss(
     trajectories: Tensor, probabilities: Tensor, future: Tensor, valid: Tensor
 ) -> Tensor:
-    """The best mode is pulled to the truth, its end most; every mode learns how likely it is.
+    """The best mode is pulled to the truth, its end a little more; all learn how likely they are.
 
-    Best is the mode with the least ADE plus half its final error. The likelihood to learn is soft:
-    a mode that comes nearly as close as the best is nearly as right.
+    Best is the mode that ends nearest, as Argoverse counts: the ADE of that one is minADE. The
+    likelihood to learn is soft: a mode that comes nearly as close as the best is nearly as right.
     """
     ade = mode_displacement(trajectories, future, valid)  # (B, K)
     fde = _final_displacement(trajectories, future, valid)
-    best = (ade + 0.5 * fde).argmin(-1, keepdim=True)
+    best = fde.argmin(-1, keepdim=True)
     soft = (-(ade + fde).detach() / SOFTNESS_M).softmax(-1)
     likelihood = (soft * probabilities.clamp(min=_TINY).log()).sum(-1)
     pull = ade.gather(1, best) + FINAL_SHARE * fde.gather(1, best)
@@ -52,7 +52,7 @@ def soft_mode_loss(
 
 SOFTNESS_M = 1.0
 """Modes whose errors differ by less are about as likely."""
-FINAL_SHARE = 0.3
+FINAL_SHARE = 0.1
 LIKELIHOOD_SHARE = 0.7
 
 

@@ -17,6 +17,8 @@ from eqrt.training.dataset.windows import MIN_DRIVE_M, Windows, join
 from eqrt.training.recordings.recording import Source
 from eqrt.training.sampling import Pool, Rows
 
+Bool = NDArray[np.bool_]
+
 _CHUNK = 4096
 """Windows looked at together."""
 
@@ -125,21 +127,40 @@ def _why_none(config: DataConfig) -> str:
 
 def _weights(config: DataConfig, store: WindowStore, rows: Rows) -> NDArray[np.float64]:
     """How often each of the rows is drawn in an epoch."""
-    kinds, weights = [store.column("focal")[rows]], [config.focal_weight]
-    if config.driving_weight != config.standing_weight:  # to tell them apart takes reading them all
-        kinds.append(_drive(store, rows))
-        weights.append(config.driving_weight)
-    return np.select(kinds, weights, config.standing_weight)
+    focal, standing = store.column("focal")[rows], config.standing_weight
+    if config.driving_weight == standing and config.partial_share == 1.0:
+        return np.where(focal, config.focal_weight, standing)  # the windows need not be read
+    drives, whole = _looked_at(store, rows)
+    weights = np.select(
+        [focal, drives], [config.focal_weight, config.driving_weight], config.standing_weight
+    )
+    return weights * np.where(whole, 1.0, config.partial_share)
 
 
-def _drive(store: WindowStore, rows: Rows) -> NDArray[np.bool_]:
+def _looked_at(store: WindowStore, rows: Rows) -> tuple[Bool, Bool]:
+    """Of each window: whether its target moves while it is seen, and whether it is whole."""
+    chunks = range(0, len(rows), _CHUNK)
+    parts = [
+        (_drive(windows), _is_whole(windows))
+        for windows in (store.gather(rows[first : first + _CHUNK]) for first in chunks)
+    ]
+    drives, whole = (np.concatenate(kind) for kind in zip(*parts, strict=True))
+    return drives, whole
+
+
+def _drive(windows: Windows) -> Bool:
     """Whether the target moves, from where it was first seen to where it was last."""
-    drive = np.zeros(len(rows), np.bool_)
-    for first in range(0, len(rows), _CHUNK):
-        windows = store.gather(rows[first : first + _CHUNK])
-        path = np.concatenate([windows.history[:, 0], windows.future], axis=1)
-        seen = np.concatenate([windows.history_valid[:, 0], windows.future_valid], axis=1)
-        row, last = np.arange(len(path)), seen.shape[1] - 1
-        moved = path[row, last - seen[:, ::-1].argmax(axis=1)] - path[row, seen.argmax(axis=1)]
-        drive[first : first + _CHUNK] = np.hypot(*moved.T) >= MIN_DRIVE_M
-    return drive
+    path = np.concatenate([windows.history[:, 0], windows.future], axis=1)
+    seen = np.concatenate([windows.history_valid[:, 0], windows.future_valid], axis=1)
+    row, last = np.arange(len(path)), seen.shape[1] - 1
+    moved = path[row, last - seen[:, ::-1].argmax(axis=1)] - path[row, seen.argmax(axis=1)]
+    drives: Bool = np.hypot(*moved.T) >= MIN_DRIVE_M
+    return drives
+
+
+def _is_whole(windows: Windows) -> Bool:
+    """Whether the target is seen at every step of the horizon, and at most of its history."""
+    history = windows.history_valid[:, 0]
+    mostly = 2 * history.sum(axis=1) > history.shape[1]
+    whole: Bool = mostly & windows.future_valid.all(axis=1)
+    return whole
