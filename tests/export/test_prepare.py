@@ -16,7 +16,9 @@ import pytest
 
 from eqrt.cli import main
 from eqrt.export.formats import FORMATS
+from eqrt.training.claim import claimed
 from eqrt.training.configuration import load_config
+from eqrt.training.dataset import prepared
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.store import open_data
 from eqrt.training.recordings.formats import find_format
@@ -361,6 +363,23 @@ def test_a_full_disk_is_said_and_leaves_nothing_half_written(
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "shard-00000: cannot be written (File too large)" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_another_run_works_on_is_left_to_it(
+    tmp_path: Path, drives: Path, model: Path, whole: Contents, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    half_written = out / ".unfinished-shard-00003-of-the-other"
+    with claimed(out):
+        half_written.mkdir()
+        assert prepare(drives, out, model) == 1
+        assert f"{out}: another process is writing to it" in capsys.readouterr().err
+        assert half_written.is_dir()
+        half_written.rmdir()
+        prepared.begin(out, prepared.read_dataset(tmp_path / "whole")[0], force=False)
+        assert prepare(drives, out, model, "--force") == 1
+    assert prepare(drives, out, model) == 0
+    assert contents(out) == whole
 
 
 def test_data_without_a_window_leaves_nothing(

@@ -14,6 +14,7 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.export.model_card import model_card
 from eqrt.training.checkpoint import load_checkpoint
+from eqrt.training.claim import claimed
 from eqrt.training.compare import Run, curve
 from eqrt.training.configuration import TrainConfig, load_config
 from eqrt.training.dataset.split import group_digest
@@ -149,6 +150,24 @@ def test_a_folder_with_a_training_in_it_is_not_overwritten(
     assert main(words) == 2
     assert "--resume" in capsys.readouterr().err
     assert (tmp_path / "out" / "model.safetensors").read_bytes() == before
+
+
+def test_a_folder_that_another_training_writes_to_is_left_to_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, out = tiny_file(tmp_path), tmp_path / "out"
+    with claimed(out):
+        for more in ((), ("--resume",)):
+            assert main(command(config, out, "--steps", "2", *more)) == 1
+            assert f"{out}: another process is writing to it" in capsys.readouterr().err
+            assert not any(out.iterdir())
+    assert main(command(config, out, "--steps", "2")) == 0
+
+
+def test_a_training_that_cannot_begin_leaves_no_folder(tmp_path: Path) -> None:
+    config, out = tiny_file(tmp_path), tmp_path / "out"
+    assert main(command(config, out, data=(tmp_path / "nothing",))) == 1
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("more", [[], ["--resume"]])

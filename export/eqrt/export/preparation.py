@@ -13,6 +13,7 @@ from pathlib import Path
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.export.cluster import run_pieces
+from eqrt.training.claim import claimed
 from eqrt.training.dataset import prepared
 from eqrt.training.dataset.pieces import Counts, Piece, RawData, ShardCutter, peak_mb, plan
 from eqrt.training.dataset.prepared import Geometry, Settings
@@ -37,7 +38,7 @@ def prepare(
     """Make the prepared `folder` of `data`, or what is missing of it, and print what came of it.
 
     Raises EqrtError at the first thing that cannot be used, unless `keep_going` skips it; whole
-    shards stay then, for the next run.
+    shards stay then, for the next run. Likewise while another process works on the folder.
     """
     parts = data.reader.parts(data.path)
     settings = Settings(
@@ -50,20 +51,21 @@ def prepare(
         split=split,
         parts=prepared.fingerprint(parts),
     )
-    if prepared.begin(folder, settings, force=force):
-        print(f"already there  {folder}")
-    else:
-        pieces = plan(parts)
-        cutter = ShardCutter(data=data, folder=folder, keep_going=keep_going)
-        try:
-            work = _make_shards(cutter, pieces, jobs, scheduler)
-            _finish(data, settings, folder, pieces)
-        except EqrtError:
-            prepared.discard_if_empty(folder)
-            raise
-        finally:
-            remove_unfinished(folder)
-        _report_work(work)
+    with claimed(folder):
+        if prepared.begin(folder, settings, force=force):
+            print(f"already there  {folder}")
+        else:
+            pieces = plan(parts)
+            cutter = ShardCutter(data=data, folder=folder, keep_going=keep_going)
+            try:
+                work = _make_shards(cutter, pieces, jobs, scheduler)
+                _finish(data, settings, folder, pieces)
+            except EqrtError:
+                prepared.discard_if_empty(folder)
+                raise
+            finally:
+                remove_unfinished(folder)
+            _report_work(work)
     _report(folder, data.contract)
 
 
