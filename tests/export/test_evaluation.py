@@ -497,6 +497,9 @@ def test_options_that_are_no_numbers(packed: Path, capsys: pytest.CaptureFixture
     for option in ("--batch", "--stride", "--threads"):
         arguments = ["--model", DEFAULT_ARTIFACT, "--data", packed, option, "0"]
         assert option in refused(capsys, arguments, 2)
+    for angle in ("nan", "inf", "north"):
+        arguments = ["--model", DEFAULT_ARTIFACT, "--data", packed, "--rotate", angle]
+        assert "--rotate" in refused(capsys, arguments, 2)
 
 
 def test_a_json_file_that_cannot_be_written(

@@ -147,6 +147,11 @@ def test_a_folder_that_cannot_be_made(packed: Path, capsys: pytest.CaptureFixtur
     assert "cannot be written" in refused(capsys, plot(packed, packed, "--worst", 1))
 
 
+def test_a_seed_below_zero(packed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plot(packed, packed, "--seed", -1) == 2
+    assert "--seed" in capsys.readouterr().err
+
+
 def test_a_model_that_is_not_there(
     packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

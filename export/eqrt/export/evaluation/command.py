@@ -7,6 +7,7 @@ measured side by side, and counted together.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every number there")
     parser.add_argument(
         "--rotate",
-        type=float,
+        type=_finite,
         default=0.0,
         metavar="DEGREES",
         help="turn the world by so much first: an equivariant model's errors stay the same",
@@ -107,6 +108,13 @@ def settings_of(args: argparse.Namespace, rotate_deg: float = 0.0) -> Settings:
         reader_options=reader_options.absolute(),
     )
     return Settings(choice=choice, rotate_deg=rotate_deg, batch=args.batch, threads=args.threads)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return number
 
 
 def positive(text: str) -> int:

@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sample", type=_count, default=12, metavar="N", help="how many at random (default 12)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
+    parser.add_argument("--seed", type=_count, default=0, help="of the sample (default 0)")
     parser.add_argument("--format", choices=("png", "svg"), default="png", help="default png")
 
 
