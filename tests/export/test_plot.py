@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from eqrt.cli import main
-from eqrt.export.evaluation.picture import Case, Outcome, cases, draw_one, draw_sheet
+from eqrt.export.evaluation.picture import SHEET_CASES, Case, Outcome, cases, draw_one, draw_sheet
 from eqrt.export.evaluation.plot import Ranking
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from packed_scenes import NOW, PackedScene, straight, write_packed
@@ -96,6 +96,19 @@ def test_only_several_modes_have_a_less_probable_one() -> None:
 def test_a_sheet_has_a_picture_of_each() -> None:
     assert len(draw_sheet([one_case()] * 6, "six").axes) == 6
     assert len(draw_sheet([one_case()], "one").axes) == 1
+
+
+def test_a_sheet_holds_the_first_of_many() -> None:
+    sheet = draw_sheet([one_case()] * (SHEET_CASES + 1), "many")
+    assert len(sheet.axes) == SHEET_CASES
+
+
+def test_names_are_drawn_as_they_are(packed: Path, tmp_path: Path) -> None:
+    """Two dollar signs would make a formula of what stands between them."""
+    data = packed.rename(tmp_path / "a$^$b.npz")
+    assert plot(data, tmp_path / "out", "--worst", 1, "--sample", 0, "--format", "svg") == 0
+    figure = draw_one(replace(one_case(), name="a$^$b"))
+    figure.savefig(tmp_path / "one.svg")
 
 
 def test_pictures_of_the_worst_and_of_a_sample(packed: Path, tmp_path: Path) -> None:
