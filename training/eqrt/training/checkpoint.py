@@ -72,6 +72,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
     the fields that differ.
     """
     tensors, header = read_tensors(path)
+    if "card" not in header:
+        raise EqrtError(
+            f"{path}: not a checkpoint (no card in it); give the model.safetensors that "
+            "`eqrt train` writes"
+        )
     try:
         tables = json.loads(header["config"])
         config = ModelConfig.from_tables(tables["scene"], tables["network"])
@@ -99,6 +104,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
     Raises EqrtError if it is missing or damaged.
     """
+    if path.is_dir():
+        raise EqrtError(f"{path}: a folder; give the model.safetensors in it")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             names = file.keys()
