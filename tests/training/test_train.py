@@ -193,6 +193,13 @@ def test_a_folder_that_cannot_be_made_is_said(
     assert f"eqrt: {config / 'out'}: cannot be written (Not a directory)" in capsys.readouterr().err
 
 
+def test_can_logs_are_prepared_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "drive.log"
+    log.write_text("(0.0) can0 60A#00\n")
+    assert main(command(tiny_file(tmp_path), tmp_path / "out", data=(log,))) == 1
+    assert "CAN logs are read by `eqrt prepare` first" in capsys.readouterr().err
+
+
 def test_a_training_that_cannot_begin_leaves_no_folder(tmp_path: Path) -> None:
     config, out = tiny_file(tmp_path), tmp_path / "out"
     assert main(command(config, out, data=(tmp_path / "nothing",))) == 1
