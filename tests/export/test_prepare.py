@@ -22,6 +22,7 @@ from eqrt.training.dataset import prepared
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.store import open_data
 from eqrt.training.recordings.formats import find_format
+from packed_scenes import PackedScene, straight, write_packed
 from processes import EQRT, environment
 from source_tree import ROOT
 from tiny_training import DATA, tiny, tiny_file
@@ -88,6 +89,16 @@ def test_a_prepared_folder_holds_the_windows_of_the_raw_data(
     assert "scenes/s\n" in said
     assert "peak memory" in said
     assert "licence" not in said  # it may be used commercially
+    assert "\nlanes " not in said  # there are some
+
+
+def test_data_without_a_map_says_so(
+    tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Argoverse's maps are a download of their own, and easily forgotten."""
+    data = write_packed(tmp_path / "scenes.npz", [PackedScene([straight(10.0)])])
+    assert prepare(data, tmp_path / "out", model) == 0
+    assert "\nlanes          none: no map was found" in capsys.readouterr().out
 
 
 def test_a_non_commercial_licence_is_printed(

@@ -170,6 +170,8 @@ def _report(folder: Path, contract: ModelContract) -> None:
     print(f"recordings     {len(sides)}: {sides.count('train')} train, {sides.count('val')} val")
     print(f"windows        {len(store)}: {train} train, {val} val")
     print(f"size           {size / 1e6:.1f} MB in {totals.shards} shards")
+    if not store.has_lanes():
+        print("lanes          none: no map was found or given (docs/data.md says where it belongs)")
     if not (train and val):
         print(f"one side of the split is empty; {_why_empty(settings.split)}")
     if totals.skipped:
