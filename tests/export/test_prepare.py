@@ -475,6 +475,30 @@ def test_a_can_log_is_prepared_through_the_service(
     assert (ready.column("step") == CONTRACT.history_steps - 1).all()
 
 
+def test_a_profile_that_was_edited_since_makes_other_windows(
+    tmp_path: Path,
+    model: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Of a profile's file, its contents count, and not from where it was named."""
+    log, out, profile = tmp_path / "drive.log", tmp_path / "out", tmp_path / "mine.toml"
+    whole = gzip.decompress((ROOT / "tests/data/can/ars408/candump.log.gz").read_bytes())
+    log.write_bytes(b"".join(whole.splitlines(keepends=True)[:2500]))
+    text = (ROOT / "runtime/eqrt/runtime/decoding/profiles/ars408.toml").read_text()
+    profile.write_text(text)
+    monkeypatch.chdir(tmp_path)
+    assert prepare(log, out, model, "--stationary", "--profile", "mine.toml") == 0
+    monkeypatch.chdir("/")
+    assert prepare(log, out, model, "--stationary", "--profile", str(profile)) == 0
+    assert "already there" in capsys.readouterr().out
+    assert "x_m = 0.0, y_m = 0.0" in text
+    profile.write_text(text.replace("x_m = 0.0, y_m = 0.0", "x_m = 3.5, y_m = 0.0"))
+    assert prepare(log, out, model, "--stationary", "--profile", str(profile)) == 1
+    assert "prepared with other settings (reader was" in capsys.readouterr().err
+    assert prepare(log, out, model, "--stationary", "--profile", str(profile), "--force") == 0
+
+
 def test_a_training_configuration_says_for_which_model(tmp_path: Path) -> None:
     config = min((ROOT / "training/configs").glob("*.toml"))
     command = ["prepare", str(SCENARIO), "--out", str(tmp_path / "out"), "--stride", "20"]

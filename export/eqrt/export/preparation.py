@@ -13,6 +13,8 @@ from pathlib import Path
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.export.cluster import run_pieces
+from eqrt.export.profiles import profile_id
+from eqrt.runtime.prediction.tiles import load_tile
 from eqrt.training.claim import claimed
 from eqrt.training.dataset import prepared
 from eqrt.training.dataset.pieces import Counts, Piece, RawData, ShardCutter, peak_mb, plan
@@ -20,6 +22,7 @@ from eqrt.training.dataset.prepared import Geometry, Settings
 from eqrt.training.dataset.shards import ShardIndex, open_shard, remove_unfinished, shard_folder
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.store import license_notice, no_windows_error, open_data
+from eqrt.training.recordings.formats import ReaderOptions
 
 NAMED_SKIPS = 5
 """So many of what was skipped are named; all are in skipped.txt."""
@@ -44,7 +47,7 @@ def prepare(
     settings = Settings(
         path=str(data.path),
         format=data.format,
-        reader=data.reader_options.given(),
+        reader=_with_contents(data.reader_options),
         source=data.reader.source,
         geometry=Geometry.of(data.contract),
         options=data.options,
@@ -67,6 +70,16 @@ def prepare(
                 remove_unfinished(folder)
             _report_work(work)
     _report(folder, data.contract)
+
+
+def _with_contents(options: ReaderOptions) -> dict[str, str]:
+    """What was said of the data, and of files what is in them: an edited profile makes others."""
+    given = options.given()
+    if options.profile is not None:
+        given["profile"] = profile_id(options.profile)
+    if options.tile is not None:
+        given["tile"] = load_tile(options.tile).info.tile_id
+    return given
 
 
 @dataclass(frozen=True, slots=True)

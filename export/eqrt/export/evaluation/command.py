@@ -16,6 +16,7 @@ from eqrt.export.evaluation.measure import Measured, Piece, Settings, measure_pi
 from eqrt.export.evaluation.report import as_json, as_text, write_json
 from eqrt.export.evaluation.selection import Choice
 from eqrt.export.formats import add_reader_arguments
+from eqrt.export.profiles import absolute_profile
 from eqrt.training.dataset.split import SIDES
 from eqrt.training.dataset.windows import TARGETS
 from eqrt.training.recordings.formats import ReaderOptions
@@ -96,7 +97,7 @@ def settings_of(args: argparse.Namespace, rotate_deg: float = 0.0) -> Settings:
     """The options of `add_shared_arguments` as settings."""
     reader_options = ReaderOptions(
         maps=args.maps,
-        profile=args.profile,
+        profile=args.profile and absolute_profile(args.profile),
         tile=args.tile,
         can=tuple(args.can),
         stationary=args.stationary,
