@@ -188,6 +188,20 @@ def test_a_shard_that_the_disk_lost_is_made_again(
     assert contents(killed) == whole
 
 
+def test_a_shard_that_a_finished_folder_lost_is_made_again(
+    tmp_path: Path, drives: Path, model: Path, whole: Contents, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who reads the folder is told to prepare it again."""
+    out = tmp_path / "whole"
+    shutil.rmtree(out / "shard-00001")
+    lost = out / "shard-00003/provenance.npy"
+    lost.write_bytes(lost.read_bytes()[:-8])
+    capsys.readouterr()
+    assert prepare(drives, out, model) == 0
+    assert "going on       3 of 5 shards are there" in capsys.readouterr().out
+    assert contents(out) == whole
+
+
 def test_an_unfinished_folder_may_be_split_another_way(
     killed: Path, drives: Path, model: Path
 ) -> None:

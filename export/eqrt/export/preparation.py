@@ -54,12 +54,14 @@ def prepare(
         split=split,
         parts=prepared.fingerprint(parts),
     )
+    pieces = plan(parts)
+    cutter = ShardCutter(data=data, folder=folder, keep_going=keep_going)
     with claimed(folder):
-        if prepared.begin(folder, settings, force=force):
+        if prepared.begin(folder, settings, force=force) and all(
+            _index(cutter, piece) for piece in pieces
+        ):
             print(f"already there  {folder}")
         else:
-            pieces = plan(parts)
-            cutter = ShardCutter(data=data, folder=folder, keep_going=keep_going)
             try:
                 work = _make_shards(cutter, pieces, jobs, scheduler)
                 _finish(data, settings, folder, pieces)
@@ -94,7 +96,7 @@ def _make_shards(
     cutter: ShardCutter, pieces: Sequence[Piece], jobs: int, scheduler: str | None
 ) -> _Work:
     """Make the shards that are not there yet."""
-    missing = [piece for piece in pieces if _index(cutter, piece) is None]
+    missing = [piece for piece in pieces if not _counts(_index(cutter, piece), cutter)]
     if len(missing) < len(pieces):
         print(f"going on       {len(pieces) - len(missing)} of {len(pieces)} shards are there")
     began, counts = time.perf_counter(), Counts()
@@ -110,15 +112,19 @@ def _make_shards(
 
 
 def _index(cutter: ShardCutter, piece: Piece) -> ShardIndex | None:
-    """The shard of a piece, if it is whole, and nothing in it was skipped that now counts."""
+    """The shard of a piece, if it is there and whole."""
     path = shard_folder(cutter.folder, piece.number)
     if not path.is_dir():
         return None
     try:
-        index = open_shard(path, cutter.data.contract).index
+        return open_shard(path, cutter.data.contract).index
     except EqrtError:
         return None
-    return None if index.skipped and not cutter.keep_going else index
+
+
+def _counts(index: ShardIndex | None, cutter: ShardCutter) -> bool:
+    """Whether a shard need not be made: nothing in it was skipped that now ends the run."""
+    return index is not None and (cutter.keep_going or not index.skipped)
 
 
 def _finish(data: RawData, settings: Settings, folder: Path, pieces: Sequence[Piece]) -> None:

@@ -182,7 +182,7 @@ def finish(folder: Path, settings: Settings, shards: int, counts: Counts) -> Non
             write_whole(folder / SKIPPED, lines.encode())
         dataset = Dataset(schema=SCHEMA, settings=settings, totals=totals)
         write_whole(folder / DATASET, _page(dataset))
-        (folder / _UNFINISHED).unlink()
+        (folder / _UNFINISHED).unlink(missing_ok=True)  # not there if shards were lost since
     except OSError as error:
         raise EqrtError(f"{folder}: cannot be written ({error.strerror})") from error
 
