@@ -511,6 +511,9 @@ def test_a_profile_that_was_edited_since_makes_other_windows(
     assert prepare(log, out, model, "--stationary", "--profile", str(profile)) == 1
     assert "prepared with other settings (reader was" in capsys.readouterr().err
     assert prepare(log, out, model, "--stationary", "--profile", str(profile), "--force") == 0
+    seldom = ("--stride", "100000")
+    assert prepare(log, tmp_path / "none", model, "--stationary", "--profile", "ars408", *seldom)
+    assert "(targets all, stride 100000)" in capsys.readouterr().err
 
 
 def test_a_training_configuration_says_for_which_model(tmp_path: Path) -> None:

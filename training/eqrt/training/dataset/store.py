@@ -248,10 +248,11 @@ def _cut_into_memory(data: RawData, split: Split) -> WindowStore:
 def no_windows_error(data: RawData, recordings: int) -> EqrtError:
     """For recordings that can be read, and of which nothing is left to train on."""
     options = data.options
+    stride = options.stride or data.reader_options.stride  # whichever of them chooses the steps
     hint = "; perhaps it names no targets: try all" if options.targets == "focal" else ""
     return EqrtError(
         f"{data.path}: no window in {recordings} recordings (targets {options.targets}, stride "
-        f"{options.stride}){hint}"
+        f"{stride}){hint}"
     )
 
 
