@@ -419,7 +419,7 @@ def test_a_split_with_an_empty_side_is_said(
     tmp_path: Path, drives: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert prepare(drives, tmp_path / "out", model, "--held-out", "0") == 0
-    assert "one side of the split is empty" in capsys.readouterr().out
+    assert "one side of the split is empty; as --held-out has it" in capsys.readouterr().out
 
 
 def test_named_groups_are_held_out(

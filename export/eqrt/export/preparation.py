@@ -202,6 +202,8 @@ def _report(folder: Path, contract: ModelContract) -> None:
 def _why_empty(split: Split) -> str:
     if split.others_elsewhere:
         return "as the configuration's held_out has it"
+    if not split.held_out and split.held_out_share in (0.0, 1.0):
+        return "as --held-out has it"
     return "few groups: name some with --held-out-groups"
 
 
