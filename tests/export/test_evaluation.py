@@ -497,6 +497,23 @@ def test_options_that_are_no_numbers(packed: Path, capsys: pytest.CaptureFixture
     for option in ("--batch", "--stride", "--threads"):
         arguments = ["--model", DEFAULT_ARTIFACT, "--data", packed, option, "0"]
         assert option in refused(capsys, arguments, 2)
+    for angle in ("nan", "inf", "north"):
+        arguments = ["--model", DEFAULT_ARTIFACT, "--data", packed, "--rotate", angle]
+        assert "--rotate" in refused(capsys, arguments, 2)
+
+
+@pytest.mark.parametrize(
+    "option", [("--stride", 3), ("--maps", "maps"), ("--profile", "ars408"), ("--stationary",)]
+)
+def test_options_for_raw_data_are_refused_with_prepared_data(
+    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[object, ...]
+) -> None:
+    out = tmp_path / "prepared"
+    words = ["prepare", packed, "--out", out, "--model", DEFAULT_ARTIFACT, "--jobs", 1]
+    assert main([str(word) for word in words]) == 0
+    capsys.readouterr()
+    arguments = ["--model", DEFAULT_ARTIFACT, "--data", out, *option]
+    assert f"{option[0]} is for raw data" in refused(capsys, arguments, 2)
 
 
 def test_a_json_file_that_cannot_be_written(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from eqrt.cli import main
-from eqrt.export.evaluation.picture import Case, Outcome, cases, draw_one, draw_sheet
+from eqrt.export.evaluation.picture import SHEET_CASES, Case, Outcome, cases, draw_one, draw_sheet
 from eqrt.export.evaluation.plot import Ranking
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
 from packed_scenes import NOW, PackedScene, straight, write_packed
@@ -98,6 +98,19 @@ def test_a_sheet_has_a_picture_of_each() -> None:
     assert len(draw_sheet([one_case()], "one").axes) == 1
 
 
+def test_a_sheet_holds_the_first_of_many() -> None:
+    sheet = draw_sheet([one_case()] * (SHEET_CASES + 1), "many")
+    assert len(sheet.axes) == SHEET_CASES
+
+
+def test_names_are_drawn_as_they_are(packed: Path, tmp_path: Path) -> None:
+    """Two dollar signs would make a formula of what stands between them."""
+    data = packed.rename(tmp_path / "a$^$b.npz")
+    assert plot(data, tmp_path / "out", "--worst", 1, "--sample", 0, "--format", "svg") == 0
+    figure = draw_one(replace(one_case(), name="a$^$b"))
+    figure.savefig(tmp_path / "one.svg")
+
+
 def test_pictures_of_the_worst_and_of_a_sample(packed: Path, tmp_path: Path) -> None:
     out = tmp_path / "pictures"
     assert plot(packed, out, "--worst", 2, "--sample", 1) == 0
@@ -145,6 +158,11 @@ def test_data_without_a_complete_window(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_folder_that_cannot_be_made(packed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "cannot be written" in refused(capsys, plot(packed, packed, "--worst", 1))
+
+
+def test_a_seed_below_zero(packed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plot(packed, packed, "--seed", -1) == 2
+    assert "--seed" in capsys.readouterr().err
 
 
 def test_a_model_that_is_not_there(

@@ -16,10 +16,13 @@ import pytest
 
 from eqrt.cli import main
 from eqrt.export.formats import FORMATS
+from eqrt.training.claim import claimed
 from eqrt.training.configuration import load_config
+from eqrt.training.dataset import prepared
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.store import open_data
 from eqrt.training.recordings.formats import find_format
+from packed_scenes import PackedScene, straight, write_packed
 from processes import EQRT, environment
 from source_tree import ROOT
 from tiny_training import DATA, tiny, tiny_file
@@ -86,6 +89,16 @@ def test_a_prepared_folder_holds_the_windows_of_the_raw_data(
     assert "scenes/s\n" in said
     assert "peak memory" in said
     assert "licence" not in said  # it may be used commercially
+    assert "\nlanes " not in said  # there are some
+
+
+def test_data_without_a_map_says_so(
+    tmp_path: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Argoverse's maps are a download of their own, and easily forgotten."""
+    data = write_packed(tmp_path / "scenes.npz", [PackedScene([straight(10.0)])])
+    assert prepare(data, tmp_path / "out", model) == 0
+    assert "\nlanes          none: no map was found" in capsys.readouterr().out
 
 
 def test_a_non_commercial_licence_is_printed(
@@ -173,6 +186,20 @@ def test_a_shard_that_the_disk_lost_is_made_again(
     lost.write_bytes(lost.read_bytes()[:5000])
     assert prepare(drives, killed, model) == 0
     assert contents(killed) == whole
+
+
+def test_a_shard_that_a_finished_folder_lost_is_made_again(
+    tmp_path: Path, drives: Path, model: Path, whole: Contents, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who reads the folder is told to prepare it again."""
+    out = tmp_path / "whole"
+    shutil.rmtree(out / "shard-00001")
+    lost = out / "shard-00003/provenance.npy"
+    lost.write_bytes(lost.read_bytes()[:-8])
+    capsys.readouterr()
+    assert prepare(drives, out, model) == 0
+    assert "going on       3 of 5 shards are there" in capsys.readouterr().out
+    assert contents(out) == whole
 
 
 def test_an_unfinished_folder_may_be_split_another_way(
@@ -363,6 +390,23 @@ def test_a_full_disk_is_said_and_leaves_nothing_half_written(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_that_another_run_works_on_is_left_to_it(
+    tmp_path: Path, drives: Path, model: Path, whole: Contents, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    half_written = out / ".unfinished-shard-00003-of-the-other"
+    with claimed(out):
+        half_written.mkdir()
+        assert prepare(drives, out, model) == 1
+        assert f"{out}: another process is writing to it" in capsys.readouterr().err
+        assert half_written.is_dir()
+        half_written.rmdir()
+        prepared.begin(out, prepared.read_dataset(tmp_path / "whole")[0], force=False)
+        assert prepare(drives, out, model, "--force") == 1
+    assert prepare(drives, out, model) == 0
+    assert contents(out) == whole
+
+
 def test_data_without_a_window_leaves_nothing(
     tmp_path: Path, drives: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -375,7 +419,7 @@ def test_a_split_with_an_empty_side_is_said(
     tmp_path: Path, drives: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert prepare(drives, tmp_path / "out", model, "--held-out", "0") == 0
-    assert "one side of the split is empty" in capsys.readouterr().out
+    assert "one side of the split is empty; as --held-out has it" in capsys.readouterr().out
 
 
 def test_named_groups_are_held_out(
@@ -443,6 +487,33 @@ def test_a_can_log_is_prepared_through_the_service(
     ready = open_data(out, CONTRACT)
     assert {entry.group for entry in ready.recordings} == {"candump.log.gz"}
     assert (ready.column("step") == CONTRACT.history_steps - 1).all()
+
+
+def test_a_profile_that_was_edited_since_makes_other_windows(
+    tmp_path: Path,
+    model: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Of a profile's file, its contents count, and not from where it was named."""
+    log, out, profile = tmp_path / "drive.log", tmp_path / "out", tmp_path / "mine.toml"
+    whole = gzip.decompress((ROOT / "tests/data/can/ars408/candump.log.gz").read_bytes())
+    log.write_bytes(b"".join(whole.splitlines(keepends=True)[:2500]))
+    text = (ROOT / "runtime/eqrt/runtime/decoding/profiles/ars408.toml").read_text()
+    profile.write_text(text)
+    monkeypatch.chdir(tmp_path)
+    assert prepare(log, out, model, "--stationary", "--profile", "mine.toml") == 0
+    monkeypatch.chdir("/")
+    assert prepare(log, out, model, "--stationary", "--profile", str(profile)) == 0
+    assert "already there" in capsys.readouterr().out
+    assert "x_m = 0.0, y_m = 0.0" in text
+    profile.write_text(text.replace("x_m = 0.0, y_m = 0.0", "x_m = 3.5, y_m = 0.0"))
+    assert prepare(log, out, model, "--stationary", "--profile", str(profile)) == 1
+    assert "prepared with other settings (reader was" in capsys.readouterr().err
+    assert prepare(log, out, model, "--stationary", "--profile", str(profile), "--force") == 0
+    seldom = ("--stride", "100000")
+    assert prepare(log, tmp_path / "none", model, "--stationary", "--profile", "ars408", *seldom)
+    assert "(targets all, stride 100000)" in capsys.readouterr().err
 
 
 def test_a_training_configuration_says_for_which_model(tmp_path: Path) -> None:

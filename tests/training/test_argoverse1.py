@@ -295,3 +295,26 @@ def test_every_recording_on_a_broken_map_says_so(data: Path, tmp_path: Path) -> 
     for _ in range(2):
         with pytest.raises(LogError, match=r"10314_vector_map\.xml: no lanes"):
             read(data / "1.csv", maps)
+
+
+@pytest.mark.parametrize(
+    ("folder", "group"),
+    [
+        ("train/data", "7"),
+        ("val/data", "val/7"),
+        ("test_obs/data", "test_obs/7"),
+        ("val", "val/7"),
+        ("mine", "7"),
+    ],
+)
+def test_numbers_of_other_splits_are_other_scenes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, group: str
+) -> None:
+    """Each split counts its sequences anew."""
+    data = tmp_path / folder
+    data.mkdir(parents=True)
+    (data / "7.csv").write_text(sequence(stamps()))
+    monkeypatch.chdir(data)
+    for path in (data / "7.csv", Path("7.csv")):
+        recording = read(path)
+        assert (recording.name, recording.group) == ("7", group)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,11 @@ def changed(path: Path, **arrays: Any) -> Path:
         ({"track_step": np.full(138, 77)}, "scene 1: a step of track 0 is not within 0 to 49"),
         ({"track_xy": np.full((138, 2), np.nan)}, "scene 1: a position is not a number"),
         ({"scene_track_ptr": np.array([0, 0, 3])}, "scene 1: no tracks"),
+        ({"orig": np.zeros((2, 3))}, "orig is float64 of shape (2, 3), expected numbers of shape"),
+        ({"track_xy": np.zeros((138, 3))}, "track_xy is float64 of shape (138, 3)"),
+        ({"seq_id": np.int64(1)}, "seq_id is int64 of shape ()"),
+        ({"track_step": np.zeros(138, np.int16)}, "scene 1: track 0 is seen twice at one step"),
+        ({"lane_xy": np.full((6, 2), np.nan)}, "scene 1: a point of a lane is not a number"),
     ],
 )
 def test_a_damaged_file_is_refused_with_its_name_and_the_reason(
@@ -91,6 +97,27 @@ def test_a_damaged_file_is_refused_with_its_name_and_the_reason(
 def test_half_a_file_is_refused(path: Path, size: int) -> None:
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(LogError, match="not a readable"):
+        recordings(path)
+
+
+def test_damaged_compression_is_refused(path: Path) -> None:
+    with np.load(path) as file:
+        content = {name: file[name] for name in file.files}
+    np.savez_compressed(path, **content)
+    data = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        begin = archive.getinfo("track_xy.npy").header_offset + 30 + len("track_xy.npy") + 20
+    data[begin : begin + 8] = 8 * b"\xff"
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="not a readable"):
+        recordings(path)
+
+
+def test_a_single_array_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "array.npz"
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(LogError, match=r"not a readable \.npz file \(it holds a single array"):
         recordings(path)
 
 

@@ -17,6 +17,7 @@ from eqrt.training.checkpoint import (
     write_tensors,
 )
 from eqrt.training.networks.registry import build_network
+from eqrt.training.state import new_state, save_state
 from tiny_training import tiny
 
 CARD = Card(
@@ -71,6 +72,16 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EqrtError, match="not a checkpoint") as refused:
         load_checkpoint(tmp_path / "bad.safetensors")
     assert "\n" not in str(refused.value)
+    with pytest.raises(EqrtError, match=r"a folder; give the model\.safetensors in it"):
+        load_checkpoint(tmp_path)
+
+
+def test_the_state_of_a_training_is_no_checkpoint(tmp_path: Path) -> None:
+    config = tiny()
+    state = new_state(config, torch.device("cpu"))
+    save_state(tmp_path / "state.safetensors", state, config, {})
+    with pytest.raises(EqrtError, match=r"no card in it\); give the model\.safetensors"):
+        load_checkpoint(tmp_path / "state.safetensors")
 
 
 @pytest.mark.parametrize(

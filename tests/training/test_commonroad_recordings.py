@@ -83,12 +83,20 @@ def test_an_empty_folder_is_an_error_a_user_understands(tmp_path: Path) -> None:
         CommonRoadReader().parts(tmp_path)
 
 
-def test_a_scenario_of_days_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("last_step", "said"),
+    [
+        ("999999999", "a time step is not within 0 to 100000"),
+        ("3000000000", "obstacle 507: a time is beyond 2147483647 steps"),
+        ("1e300", "obstacle 507: a time is beyond"),
+    ],
+)
+def test_a_scenario_of_days_is_refused(tmp_path: Path, last_step: str, said: str) -> None:
     """A wrong time must not fill the memory."""
     text = gzip.decompress(SCENARIO.read_bytes()).decode()
     last = text.rindex("<time>", 0, text.index("</trajectory>"))
     begin = text.index("<exact>", last) + len("<exact>")
     path = tmp_path / "long.xml"
-    path.write_text(f"{text[:begin]}999999999{text[text.index('<', begin) :]}")
-    with pytest.raises(LogError, match=r"long\.xml: a time step is not within 0 to 100000"):
+    path.write_text(f"{text[:begin]}{last_step}{text[text.index('<', begin) :]}")
+    with pytest.raises(LogError, match=rf"long\.xml: {said}"):
         list(CommonRoadReader().read(CommonRoadReader().parts(path)[0]))

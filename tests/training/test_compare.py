@@ -94,5 +94,7 @@ def test_the_command_prints_the_table_and_draws_the_curve(
     assert "| turned-5 | 330,000 | 143 |" in capsys.readouterr().out
     assert "recordings trained on" in (tmp_path / "curve.svg").read_text()
     assert main(["compare", *runs, "--plot", str(tmp_path / "curve.pdf")]) == 2
+    assert main(["compare", *runs, "--plot", str(tmp_path / "curve.svg" / "x.png")]) == 1
+    assert "x.png: cannot be written (" in capsys.readouterr().err
     assert main(["compare", str(tmp_path / "nowhere")]) == 1
     assert "no such checkpoint" in capsys.readouterr().err

@@ -28,6 +28,7 @@ def test_every_configuration_that_ships_is_read_and_comes_back(path: Path) -> No
     [
         (("seed = 1", "sead = 1"), r"\[train\] has .*unknown fields: sead"),
         (("seed = 1", ""), r"\[train\].*seed"),
+        (("seed = 1", "seed = 9223372036854775808"), r"\[train\].*seed"),
         (("heads = 2", ""), r"\[network\].*heads"),
         (('kind = "compact"', 'kind = "oracle"'), r"\[network\] kind is 'oracle'"),
         (('name = "tiny"', "name ="), "not TOML"),

@@ -13,6 +13,7 @@ import pytest
 
 from eqrt.core.errors import EqrtError
 from eqrt.training.checkpoint import read_tensors, write_tensors
+from eqrt.training.progress import Lines
 from eqrt.training.sampling import Pool
 from eqrt.training.train import train
 from eqrt.training.training_data import TrainingData
@@ -167,6 +168,25 @@ def test_a_finished_training_has_nothing_left_to_do(begun: Path) -> None:
     assert (begun / "model.safetensors").read_bytes() == before
 
 
+class GoneAt(Lines):
+    """Whoever reads the lines is gone when it is to read one that begins so."""
+
+    def __init__(self, beginning: str) -> None:
+        self._beginning = beginning
+
+    def line(self, text: str) -> None:
+        if text.startswith(self._beginning):
+            raise BrokenPipeError
+
+
+def test_what_was_evaluated_is_written_though_nobody_listens(tmp_path: Path) -> None:
+    """Ctrl-C ends the `tee` behind a training before the training."""
+    with pytest.raises(BrokenPipeError):
+        train(tiny().with_steps(2), tiny_data(), tmp_path, display=GoneAt("step      2"))
+    assert json.loads(read_tensors(tmp_path / "state.safetensors")[1]["step"]) == 2
+    assert (tmp_path / "model.safetensors").exists()
+
+
 def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupted before the new one is whole, the old one is still there."""
     path = tmp_path / "x.safetensors"
@@ -176,6 +196,7 @@ def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         raise OSError("no power")
 
     monkeypatch.setattr(os, "fsync", pull_the_plug)
-    with pytest.raises(OSError, match="no power"):
+    with pytest.raises(EqrtError, match=r"x\.safetensors: cannot be written \(no power\)"):
         write_tensors(path, {}, {"step": "2"})
     assert read_tensors(path)[1] == {"step": "1"}
+    assert list(tmp_path.iterdir()) == [path]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,14 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.export.model_card import model_card
 from eqrt.training.checkpoint import load_checkpoint
+from eqrt.training.claim import claimed
 from eqrt.training.compare import Run, curve
 from eqrt.training.configuration import TrainConfig, load_config
 from eqrt.training.dataset.split import group_digest
 from eqrt.training.dataset.store import open_data
 from eqrt.training.evaluate import INPUTS, evaluate, evaluate_constant_velocity, predict
 from eqrt.training.networks.registry import build_network
-from eqrt.training.recorder import MODEL_FILE
+from eqrt.training.recorder import MODEL_FILE, STATE_FILE
 from eqrt.training.sampling import Pool
 from eqrt.training.state import new_optimizer, new_state, update_average
 from eqrt.training.train import learning_rate, train, train_step
@@ -149,6 +151,59 @@ def test_a_folder_with_a_training_in_it_is_not_overwritten(
     assert main(words) == 2
     assert "--resume" in capsys.readouterr().err
     assert (tmp_path / "out" / "model.safetensors").read_bytes() == before
+
+
+def test_a_folder_that_another_training_writes_to_is_left_to_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, out = tiny_file(tmp_path), tmp_path / "out"
+    with claimed(out):
+        for more in ((), ("--resume",)):
+            assert main(command(config, out, "--steps", "2", *more)) == 1
+            assert f"{out}: another process is writing to it" in capsys.readouterr().err
+            assert not any(out.iterdir())
+    assert main(command(config, out, "--steps", "2")) == 0
+
+
+@pytest.mark.parametrize(
+    ("size", "name"),
+    [(100, "metrics.jsonl"), (20_000, MODEL_FILE), (60_000, STATE_FILE)],
+)
+def test_a_full_disk_is_said_and_leaves_nothing_half_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: int, name: str
+) -> None:
+    config, out = tiny_file(tmp_path), tmp_path / "out"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        assert main(command(config, out, "--steps", "2")) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert f"eqrt: {out / name}: cannot be written (File too large)" in capsys.readouterr().err
+    names = ["metrics.jsonl", MODEL_FILE, STATE_FILE]
+    whole = names[: max(names.index(name), 1)]
+    assert sorted(path.name for path in out.iterdir()) == whole
+
+
+def test_a_folder_that_cannot_be_made_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny_file(tmp_path)
+    assert main(command(config, config / "out", "--steps", "2")) == 1
+    assert f"eqrt: {config / 'out'}: cannot be written (Not a directory)" in capsys.readouterr().err
+
+
+def test_can_logs_are_prepared_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "drive.log"
+    log.write_text("(0.0) can0 60A#00\n")
+    assert main(command(tiny_file(tmp_path), tmp_path / "out", data=(log,))) == 1
+    assert "CAN logs are read by `eqrt prepare` first" in capsys.readouterr().err
+
+
+def test_a_training_that_cannot_begin_leaves_no_folder(tmp_path: Path) -> None:
+    config, out = tiny_file(tmp_path), tmp_path / "out"
+    assert main(command(config, out, data=(tmp_path / "nothing",))) == 1
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("more", [[], ["--resume"]])

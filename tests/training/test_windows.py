@@ -135,6 +135,22 @@ def test_a_recording_on_another_clock_is_refused() -> None:
         WindowCutter(CONTRACT, WindowOptions()).cut(slow, 0)
 
 
+@pytest.mark.parametrize("wrong", [1e300, -2e5, np.nan])
+def test_a_recording_with_a_track_in_the_middle_of_nowhere_is_refused(wrong: float) -> None:
+    tracks = drive(2)
+    tracks.positions[1, 19, 0] = wrong
+    with pytest.raises(LogError, match="test: positions lie more than 131 km apart"):
+        cut(tracks)
+    tracks.valid[1, 19] = False
+    assert np.isfinite(cut(tracks).history).all()
+
+
+def test_a_recording_far_from_the_maps_origin_is_cut() -> None:
+    tracks = drive(2)
+    tracks.positions[:] += (5e5, 5.4e6)  # as UTM has them
+    assert len(cut(tracks)) == 2
+
+
 def test_the_lanes_of_a_window_are_chosen_as_the_contract_says() -> None:
     routes = scenario_windows()
     nearest = scenario_windows(replace(CONTRACT, lane_choice="nearest"))

@@ -13,12 +13,16 @@ from pathlib import Path
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.export.cluster import run_pieces
+from eqrt.export.profiles import profile_id
+from eqrt.runtime.prediction.tiles import load_tile
+from eqrt.training.claim import claimed
 from eqrt.training.dataset import prepared
 from eqrt.training.dataset.pieces import Counts, Piece, RawData, ShardCutter, peak_mb, plan
 from eqrt.training.dataset.prepared import Geometry, Settings
 from eqrt.training.dataset.shards import ShardIndex, open_shard, remove_unfinished, shard_folder
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.store import license_notice, no_windows_error, open_data
+from eqrt.training.recordings.formats import ReaderOptions
 
 NAMED_SKIPS = 5
 """So many of what was skipped are named; all are in skipped.txt."""
@@ -37,34 +41,47 @@ def prepare(
     """Make the prepared `folder` of `data`, or what is missing of it, and print what came of it.
 
     Raises EqrtError at the first thing that cannot be used, unless `keep_going` skips it; whole
-    shards stay then, for the next run.
+    shards stay then, for the next run. Likewise while another process works on the folder.
     """
     parts = data.reader.parts(data.path)
     settings = Settings(
         path=str(data.path),
         format=data.format,
-        reader=data.reader_options.given(),
+        reader=_with_contents(data.reader_options),
         source=data.reader.source,
         geometry=Geometry.of(data.contract),
         options=data.options,
         split=split,
         parts=prepared.fingerprint(parts),
     )
-    if prepared.begin(folder, settings, force=force):
-        print(f"already there  {folder}")
-    else:
-        pieces = plan(parts)
-        cutter = ShardCutter(data=data, folder=folder, keep_going=keep_going)
-        try:
-            work = _make_shards(cutter, pieces, jobs, scheduler)
-            _finish(data, settings, folder, pieces)
-        except EqrtError:
-            prepared.discard_if_empty(folder)
-            raise
-        finally:
-            remove_unfinished(folder)
-        _report_work(work)
+    pieces = plan(parts)
+    cutter = ShardCutter(data=data, folder=folder, keep_going=keep_going)
+    with claimed(folder):
+        if prepared.begin(folder, settings, force=force) and all(
+            _index(cutter, piece) for piece in pieces
+        ):
+            print(f"already there  {folder}")
+        else:
+            try:
+                work = _make_shards(cutter, pieces, jobs, scheduler)
+                _finish(data, settings, folder, pieces)
+            except EqrtError:
+                prepared.discard_if_empty(folder)
+                raise
+            finally:
+                remove_unfinished(folder)
+            _report_work(work)
     _report(folder, data.contract)
+
+
+def _with_contents(options: ReaderOptions) -> dict[str, str]:
+    """What was said of the data, and of files what is in them: an edited profile makes others."""
+    given = options.given()
+    if options.profile is not None:
+        given["profile"] = profile_id(options.profile)
+    if options.tile is not None:
+        given["tile"] = load_tile(options.tile).info.tile_id
+    return given
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +96,7 @@ def _make_shards(
     cutter: ShardCutter, pieces: Sequence[Piece], jobs: int, scheduler: str | None
 ) -> _Work:
     """Make the shards that are not there yet."""
-    missing = [piece for piece in pieces if _index(cutter, piece) is None]
+    missing = [piece for piece in pieces if not _counts(_index(cutter, piece), cutter)]
     if len(missing) < len(pieces):
         print(f"going on       {len(pieces) - len(missing)} of {len(pieces)} shards are there")
     began, counts = time.perf_counter(), Counts()
@@ -95,15 +112,19 @@ def _make_shards(
 
 
 def _index(cutter: ShardCutter, piece: Piece) -> ShardIndex | None:
-    """The shard of a piece, if it is whole, and nothing in it was skipped that now counts."""
+    """The shard of a piece, if it is there and whole."""
     path = shard_folder(cutter.folder, piece.number)
     if not path.is_dir():
         return None
     try:
-        index = open_shard(path, cutter.data.contract).index
+        return open_shard(path, cutter.data.contract).index
     except EqrtError:
         return None
-    return None if index.skipped and not cutter.keep_going else index
+
+
+def _counts(index: ShardIndex | None, cutter: ShardCutter) -> bool:
+    """Whether a shard need not be made: nothing in it was skipped that now ends the run."""
+    return index is not None and (cutter.keep_going or not index.skipped)
 
 
 def _finish(data: RawData, settings: Settings, folder: Path, pieces: Sequence[Piece]) -> None:
@@ -168,6 +189,8 @@ def _report(folder: Path, contract: ModelContract) -> None:
     print(f"recordings     {len(sides)}: {sides.count('train')} train, {sides.count('val')} val")
     print(f"windows        {len(store)}: {train} train, {val} val")
     print(f"size           {size / 1e6:.1f} MB in {totals.shards} shards")
+    if not store.has_lanes():
+        print("lanes          none: no map was found or given (docs/data.md says where it belongs)")
     if not (train and val):
         print(f"one side of the split is empty; {_why_empty(settings.split)}")
     if totals.skipped:
@@ -179,6 +202,8 @@ def _report(folder: Path, contract: ModelContract) -> None:
 def _why_empty(split: Split) -> str:
     if split.others_elsewhere:
         return "as the configuration's held_out has it"
+    if not split.held_out and split.held_out_share in (0.0, 1.0):
+        return "as --held-out has it"
     return "few groups: name some with --held-out-groups"
 
 

@@ -15,6 +15,7 @@ from eqrt.core.errors import ContractError, UsageError
 from eqrt.export.cluster import add_worker_arguments
 from eqrt.export.formats import FORMATS, add_reader_arguments
 from eqrt.export.preparation import prepare
+from eqrt.export.profiles import absolute_profile
 from eqrt.training.configuration import TrainConfig, load_config
 from eqrt.training.dataset.pieces import RawData
 from eqrt.training.dataset.split import Split
@@ -99,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         format_name=args.format,
         reader_options=ReaderOptions(
             maps=args.maps,
-            profile=args.profile,
+            profile=args.profile and absolute_profile(args.profile),
             tile=args.tile,
             can=tuple(args.can),
             stationary=args.stationary,

@@ -8,7 +8,6 @@ same log, profile, model and tile is not replayed again, so a run that was ended
 from __future__ import annotations
 
 import argparse
-import hashlib
 import importlib.metadata
 import sys
 import time
@@ -21,6 +20,7 @@ import msgspec
 from eqrt.core.errors import EqrtError, LogError
 from eqrt.export.can_recordings import find_logs
 from eqrt.export.cluster import add_worker_arguments, run_pieces
+from eqrt.export.profiles import absolute_profile, profile_id
 from eqrt.runtime.advice import no_predictions
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         for log in find_logs(folder)
     ]
     replayer = Replayer(
-        profile=_found(args.profile),
+        profile=absolute_profile(args.profile),
         model=args.model.resolve(),
         tile=args.tile.resolve() if args.tile else None,
         channels=tuple(args.can),
@@ -235,7 +235,7 @@ class Replayer:
         return {
             "log": f"{log.name}, {_bytes_of(log)} bytes",
             "eqrt": importlib.metadata.version("eqrt"),
-            "profile": _profile_id(self.profile),
+            "profile": profile_id(self.profile),
             "model": _predictor(self.model).model_id,
             "tile": _tile(self.tile).info.tile_id if self.tile else "",
             "channels": " ".join(self.channels),
@@ -253,17 +253,6 @@ def _tile(path: Path) -> Tile:
     return load_tile(path)
 
 
-def _profile_id(profile: str) -> str:
-    """A built-in profile's name; that of a file, with a hash of it and of the DBCs beside it."""
-    path = Path(profile)
-    if not path.is_file():
-        return profile
-    digest = hashlib.sha256()
-    for file in (path, *sorted(path.parent.glob("*.dbc"))):
-        digest.update(file.read_bytes())
-    return f"{path.name} {digest.hexdigest()}"
-
-
 def _bytes_of(log: Path) -> int:
     try:
         return log.stat().st_size
@@ -278,10 +267,3 @@ def _read_page(piece: LogToReplay) -> _Page | None:
     except (OSError, msgspec.DecodeError):
         return None
     return page if piece.lines.is_file() else None
-
-
-def _found(profile: str) -> str:
-    """A profile's file by its absolute path; a built-in profile by its name."""
-    path = Path(profile)
-    is_file = path.suffix == ".toml" or path.name != profile
-    return str(path.resolve() if is_file else profile)

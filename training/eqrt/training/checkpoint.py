@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
@@ -13,6 +12,7 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from eqrt.core.errors import EqrtError
+from eqrt.training.files import write_whole, writing
 from eqrt.training.networks.registry import ModelConfig, build_network
 
 
@@ -57,7 +57,10 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, network: nn.Module, config: ModelConfig, card: Card) -> None:
-    """Write the file at once: a reader sees the old one or the new one, never half."""
+    """Write the file at once: a reader sees the old one or the new one, never half.
+
+    Raises EqrtError if the disk does not take it.
+    """
     header = {"config": json.dumps(config.to_tables()), "card": json.dumps(asdict(card))}
     write_tensors(path, network.state_dict(), header)
 
@@ -69,6 +72,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
     the fields that differ.
     """
     tensors, header = read_tensors(path)
+    if "card" not in header:
+        raise EqrtError(
+            f"{path}: not a checkpoint (no card in it); give the model.safetensors that "
+            "`eqrt train` writes"
+        )
     try:
         tables = json.loads(header["config"])
         config = ModelConfig.from_tables(tables["scene"], tables["network"])
@@ -81,15 +89,14 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
-    """Write a safetensors file and then put it in its place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(path.suffix + ".part")
+    """Write a safetensors file and then put it in its place.
+
+    Raises EqrtError if the disk does not take it.
+    """
     ready = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with partial.open("wb") as file:
-        file.write(safetensors.torch.save(ready, metadata=header))
-        file.flush()
-        os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
-    os.replace(partial, path)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, safetensors.torch.save(ready, metadata=header))
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -97,6 +104,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
     Raises EqrtError if it is missing or damaged.
     """
+    if path.is_dir():
+        raise EqrtError(f"{path}: a folder; give the model.safetensors in it")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             names = file.keys()

@@ -79,7 +79,7 @@ class LoopConfig:
     """A key of `eqrt.training.losses.LOSSES`."""
     evaluate_every: Count
     """Steps; as often, checkpoint and state are written."""
-    seed: Annotated[int, msgspec.Meta(ge=0)]
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     precision: Literal["float32", "bf16"] = "float32"
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from eqrt.training.files import write_whole, writing
 from eqrt.training.progress import Numbers, read_lines
 
 FORMATS = ("png", "svg")
@@ -75,11 +77,17 @@ def spoken(name: str) -> str:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a file of one of FORMATS; the same figure gives the same SVG, byte for byte."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write a file of one of FORMATS; the same figure gives the same SVG, byte for byte.
+
+    Raises EqrtError if the disk does not take it.
+    """
     options = {"dpi": 120} if path.suffix == ".png" else {"metadata": {"Date": None}}
+    drawn = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "eqrt"}):
-        figure.savefig(path, **options)
+        figure.savefig(drawn, format=path.suffix.removeprefix("."), **options)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, drawn.getvalue())
 
 
 def _save(figure: Figure, path: Path) -> list[Path]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +12,8 @@ from typing import IO, Protocol, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from eqrt.training.files import write_whole, writing
 
 Numbers = Mapping[str, float]
 
@@ -103,23 +105,26 @@ class MetricsLog:
     def __init__(self, path: Path, after: int) -> None:
         """Append to the log at `path`, as it was after step `after`; 0 = a new log.
 
-        A training that was killed may have logged steps that it will now do again.
+        A training that was killed may have logged steps that it will now do again. Raises EqrtError
+        if the disk does not take it, and so does `write`.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
         kept = [line for line in read_lines(path) if line["step"] <= after] if after else []
-        partial = path.with_suffix(path.suffix + ".part")
-        partial.write_text("".join(_as_line(line) for line in kept), encoding="utf-8")
-        os.replace(partial, path)
-        self._file: IO[str] = path.open("a", encoding="utf-8")
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, "".join(map(_as_line, kept)).encode())
+            self._file: IO[str] = path.open("a", encoding="utf-8")
 
     def write(self, values: Numbers) -> None:
         """At once: whoever watches the file sees whole lines."""
-        self._file.write(_as_line(values))
-        self._file.flush()
+        with writing(self._path):
+            self._file.write(_as_line(values))
+            self._file.flush()
 
     def close(self) -> None:
         """No more lines."""
-        self._file.close()
+        with contextlib.suppress(OSError):  # of a line that `write` could not write
+            self._file.close()
 
 
 def read_lines(path: Path) -> list[dict[str, float]]:

@@ -80,9 +80,9 @@ class Recorder:
         speed = self._lap()
         metrics = evaluate(state.average, self._goal.data.held_out, config.model.scene.dt_s)
         self._log.write(self._course(speed) | metrics)
-        self._display.line(f"step {state.step:>6} loss {state.loss:.3f} {row(metrics)}")
         save_checkpoint(out / MODEL_FILE, state.average, config.model, self._card(metrics))
-        self.save_state()
+        self.save_state()  # before it is said: whoever listens may have gone
+        self._display.line(f"step {state.step:>6} loss {state.loss:.3f} {row(metrics)}")
         self._watch.resume()
 
     def save_state(self) -> None:

@@ -15,7 +15,7 @@ import argparse
 import math
 import shlex
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import torch
@@ -24,6 +24,7 @@ from torch.optim import Optimizer
 
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.training.augment import Batch
+from eqrt.training.claim import claimed
 from eqrt.training.configuration import LoopConfig, TrainConfig, load_config
 from eqrt.training.dataset.store import license_notice
 from eqrt.training.evaluate import INPUTS
@@ -85,8 +86,8 @@ def run(args: argparse.Namespace) -> int:
     """Train, evaluate, save; 128 + its number after a signal."""
     config = _config(args)
     torch.set_num_threads(args.threads)
-    _check_out(args.out, args.resume)
-    with join_ranks(args.device) as ranks:
+    with join_ranks(args.device) as ranks, claimed(args.out) if ranks.leads else nullcontext():
+        _check_out(args.out, args.resume)
         data = open_training_data(config, args.data)
         start = None if args.start is None else open_start(args.start, config)
         steps = config.train.total_steps(data.pool.samples_per_epoch)

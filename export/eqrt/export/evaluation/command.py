@@ -7,6 +7,7 @@ measured side by side, and counted together.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from eqrt.export.evaluation.measure import Measured, Piece, Settings, measure_pi
 from eqrt.export.evaluation.report import as_json, as_text, write_json
 from eqrt.export.evaluation.selection import Choice
 from eqrt.export.formats import add_reader_arguments
+from eqrt.export.profiles import absolute_profile
 from eqrt.training.dataset.split import SIDES
 from eqrt.training.dataset.windows import TARGETS
 from eqrt.training.recordings.formats import ReaderOptions
@@ -34,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every number there")
     parser.add_argument(
         "--rotate",
-        type=float,
+        type=_finite,
         default=0.0,
         metavar="DEGREES",
         help="turn the world by so much first: an equivariant model's errors stay the same",
@@ -95,7 +97,7 @@ def settings_of(args: argparse.Namespace, rotate_deg: float = 0.0) -> Settings:
     """The options of `add_shared_arguments` as settings."""
     reader_options = ReaderOptions(
         maps=args.maps,
-        profile=args.profile,
+        profile=args.profile and absolute_profile(args.profile),
         tile=args.tile,
         can=tuple(args.can),
         stationary=args.stationary,
@@ -107,6 +109,13 @@ def settings_of(args: argparse.Namespace, rotate_deg: float = 0.0) -> Settings:
         reader_options=reader_options.absolute(),
     )
     return Settings(choice=choice, rotate_deg=rotate_deg, batch=args.batch, threads=args.threads)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return number
 
 
 def positive(text: str) -> int:

@@ -29,6 +29,8 @@ MIN_VIEW_M = 30.0
 MAX_REACH_M = 200.0
 """What is farther from the target than a car can be in 3 s leaves the picture."""
 SHEET_COLUMNS = 4
+SHEET_CASES = 60
+"""No more on a sheet: a picture of 600 would have more pixels than its format can count."""
 _MARGIN = 0.08  # of the view, around what is shown
 
 
@@ -103,21 +105,22 @@ def draw_one(case: Case) -> Figure:
     _draw(axes, case)
     axes.set_xlabel("metres to the right")
     axes.set_ylabel("metres ahead")
-    axes.set_title(f"{case.name}\n{case.errors}", fontsize=10)
+    axes.set_title(f"{case.name}\n{case.errors}", fontsize=10, parse_math=False)
     _add_key(figure, columns=4, modes=len(case.modes))
     return figure
 
 
 def draw_sheet(shown: Sequence[Case], title: str) -> Figure:
-    """Many small pictures on one sheet, each at a scale of its own."""
+    """Many small pictures on one sheet, each at a scale of its own: the first SHEET_CASES."""
+    shown = shown[:SHEET_CASES]
     columns = min(SHEET_COLUMNS, len(shown))
     rows = math.ceil(len(shown) / columns)
     figure = Figure(figsize=(4.0 * columns, 4.3 * rows + 1.0), layout="constrained")
-    figure.suptitle(title, fontsize=14)
+    figure.suptitle(title, fontsize=14, parse_math=False)
     for index, case in enumerate(shown):
         axes = figure.add_subplot(rows, columns, index + 1)
         _draw(axes, case)
-        axes.set_title(f"{case.name}\n{case.errors}", fontsize=8)
+        axes.set_title(f"{case.name}\n{case.errors}", fontsize=8, parse_math=False)
         axes.tick_params(labelsize=7)
     _add_key(figure, columns=min(7, 2 * columns), modes=len(shown[0].modes))
     return figure

@@ -1,6 +1,6 @@
 """`eqrt plot`: draw predictions, the worst of a dataset and a random sample of it.
 
-One file per target, and a sheet of each kind (`worst.png`, `sample.png`).
+One file per target, and a sheet of each kind (`worst.png`, `sample.png`) with the first of them.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sample", type=_count, default=12, metavar="N", help="how many at random (default 12)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
+    parser.add_argument("--seed", type=_count, default=0, help="of the sample (default 0)")
     parser.add_argument("--format", choices=("png", "svg"), default="png", help="default png")
 
 
@@ -128,7 +128,10 @@ def cases_of(model: Model, selection: Selection, rows: Rows) -> list[Case]:
 
 
 def write_pictures(folder: Path, kind: str, shown: Sequence[Case], title: str, suffix: str) -> None:
-    """`KIND-01.png` and so on, and all of them on `KIND.png`. Raises EqrtError if that fails."""
+    """`KIND-01.png` and so on, and the first of them on `KIND.png`.
+
+    Raises EqrtError if that fails.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for number, case in enumerate(shown, start=1):

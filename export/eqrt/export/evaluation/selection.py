@@ -87,7 +87,7 @@ def select(path: Path, contract: ModelContract, choice: Choice) -> Selection:
     """Open prepared or raw data and choose windows.
 
     Raises EqrtError if `focal` targets are asked for and the data names none, UsageError if a
-    stride is asked of data that is already cut, and what `open_data` raises.
+    stride or a reader's option is given for data that is already cut, and what `open_data` raises.
     """
     store = _open(path, contract, choice)
     rows = store.rows(choice.split)
@@ -107,8 +107,9 @@ def select(path: Path, contract: ModelContract, choice: Choice) -> Selection:
 def _open(path: Path, contract: ModelContract, choice: Choice) -> WindowStore:
     """Prepared data as it is; of raw data no more windows than will be looked at."""
     if is_prepared(path):
-        if choice.stride is not None:
-            raise UsageError(f"{path}: already cut by `eqrt prepare`; --stride is for raw data")
+        stride = [] if choice.stride is None else ["stride"]
+        if given := [*stride, *choice.reader_options.given()]:
+            raise UsageError(f"{path}: already cut by `eqrt prepare`; --{given[0]} is for raw data")
         return open_data(path, contract)
     targets = choice.targets or _default_targets(path, contract, choice)
     return open_data(

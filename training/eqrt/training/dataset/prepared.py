@@ -22,9 +22,10 @@ import msgspec
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.training.dataset.pieces import Counts
-from eqrt.training.dataset.shards import remove_unfinished, write_whole
+from eqrt.training.dataset.shards import remove_unfinished
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.windows import WindowOptions
+from eqrt.training.files import write_whole
 from eqrt.training.recordings.recording import Part, Source
 
 SCHEMA = 1
@@ -181,7 +182,7 @@ def finish(folder: Path, settings: Settings, shards: int, counts: Counts) -> Non
             write_whole(folder / SKIPPED, lines.encode())
         dataset = Dataset(schema=SCHEMA, settings=settings, totals=totals)
         write_whole(folder / DATASET, _page(dataset))
-        (folder / _UNFINISHED).unlink()
+        (folder / _UNFINISHED).unlink(missing_ok=True)  # not there if shards were lost since
     except OSError as error:
         raise EqrtError(f"{folder}: cannot be written ({error.strerror})") from error
 

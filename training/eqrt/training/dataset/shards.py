@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
 from eqrt.training.dataset.windows import COLUMNS, TENSORS, Windows, no_windows
+from eqrt.training.files import UNFINISHED, write_whole
 
 Records = NDArray[np.void]
 Layout = np.dtype[np.void]
@@ -40,7 +41,6 @@ PROVENANCE = tuple(name for name in COLUMNS if name not in TENSORS)
 _WINDOWS_FILE = "windows.npy"
 _PROVENANCE_FILE = "provenance.npy"
 _RECORDINGS_FILE = "recordings.json"
-_UNFINISHED = ".unfinished-"
 
 
 def layout(contract: ModelContract, columns: Sequence[str]) -> Layout:
@@ -126,7 +126,7 @@ class ShardWriter:
 
     def __init__(self, folder: Path, number: int, contract: ModelContract) -> None:
         self._final = shard_folder(folder, number)
-        self._folder = folder / f"{_UNFINISHED}{self._final.name}-{uuid.uuid4().hex}"
+        self._folder = folder / f"{UNFINISHED}{self._final.name}-{uuid.uuid4().hex}"
         self._contract = contract
         self._recordings: list[RecordedIn] = []
         self._skipped: list[str] = []
@@ -187,25 +187,11 @@ class ShardWriter:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove what a run that was cut short left half-written."""
-    for path in folder.glob(f"{_UNFINISHED}*"):
+    for path in folder.glob(f"{UNFINISHED}*"):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that, whatever happens, it holds all of `data` or what it held before."""
-    beside = path.with_name(f"{_UNFINISHED}{path.name}")
-    try:
-        with beside.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
 
 
 class _GrowingFile:

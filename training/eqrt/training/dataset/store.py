@@ -44,7 +44,7 @@ MAX_IN_MEMORY_BYTES = 4e9
 
 
 SAMPLED = 64
-"""Windows that are read to tell whether they are still the same."""
+"""Windows that are read to tell something of all: whether they are still the same, for one."""
 
 
 class RecordingEntry(NamedTuple):
@@ -112,8 +112,11 @@ class WindowStore:
         checksum = zlib.crc32(named.encode())
         for name in PROVENANCE:
             checksum = zlib.crc32(self.column(name).tobytes(), checksum)
-        spread = np.linspace(0, len(self) - 1, min(SAMPLED, len(self))).astype(np.intp)
-        return self.gather(spread).checksum(checksum)
+        return self.gather(self._sample()).checksum(checksum)
+
+    def has_lanes(self) -> bool:
+        """Whether any of the SAMPLED windows has a centerline."""
+        return bool(self.gather(self._sample()).centerlines_valid.any())
 
     def rows(self, split: str = "all") -> Rows:
         """The rows of one side, `train` or `val`, or `all`."""
@@ -154,6 +157,10 @@ class WindowStore:
             contract=first.contract,
             source=join_sources([store.source for store in stores]),
         )
+
+    def _sample(self) -> Rows:
+        """SAMPLED rows, evenly spread."""
+        return np.linspace(0, len(self) - 1, min(SAMPLED, len(self))).astype(np.intp)
 
     def _tensors(self, rows: Rows) -> dict[str, NDArray[Any]]:
         """What training reads of the windows `rows`: block by block, then back in order."""
@@ -241,10 +248,11 @@ def _cut_into_memory(data: RawData, split: Split) -> WindowStore:
 def no_windows_error(data: RawData, recordings: int) -> EqrtError:
     """For recordings that can be read, and of which nothing is left to train on."""
     options = data.options
+    stride = options.stride or data.reader_options.stride  # whichever of them chooses the steps
     hint = "; perhaps it names no targets: try all" if options.targets == "focal" else ""
     return EqrtError(
         f"{data.path}: no window in {recordings} recordings (targets {options.targets}, stride "
-        f"{options.stride}){hint}"
+        f"{stride}){hint}"
     )
 
 

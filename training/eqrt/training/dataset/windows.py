@@ -15,7 +15,7 @@ from torch import Tensor
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import LogError
 from eqrt.core.lane_choice import centerline_source
-from eqrt.core.lanes import LaneMap
+from eqrt.core.lanes import MAX_COORDINATE_M, LaneMap
 from eqrt.core.scene import AgentHistories, CenterlineSource, Scene, build_scene, tile_origin
 from eqrt.training.recordings.recording import Recording
 
@@ -140,12 +140,19 @@ class WindowCutter:
     def cut(self, recording: Recording, index: int) -> Windows:
         """The windows of one recording, by step and then by track; `index` names it in them.
 
-        Raises LogError if its clock is not the model's.
+        Raises LogError if its clock is not the model's, or its tracks lie farther apart than any
+        drive: float32 would make them infinite, or too coarse to learn from.
         """
         if not np.isclose(recording.dt_s, self._contract.dt_s, rtol=1e-3):
             raise LogError(
                 f"{recording.name}: time step {recording.dt_s} s, the model's is "
                 f"{self._contract.dt_s} s; resample the recording"
+            )
+        seen = recording.tracks.positions[recording.tracks.valid]
+        if len(seen) and not np.ptp(seen, axis=0).max() <= MAX_COORDINATE_M:  # nor if it is NaN
+            raise LogError(
+                f"{recording.name}: positions lie more than {MAX_COORDINATE_M / 1e3:.0f} km apart; "
+                "the recording is damaged"
             )
         source = None if recording.lanes is None else self._source(recording.lanes)
         parts = [self._cut_at(recording, index, step, source) for step in self._steps(recording)]

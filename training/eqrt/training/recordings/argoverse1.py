@@ -35,6 +35,8 @@ _MAP_FOLDERS = ("map_files", "hd_maps/map_files")
 _FOLDERS_ABOVE = 4
 """The official archives unpack to `forecasting_train_v1.1/train/data/`."""
 _ORDER = {"AGENT": 0, "AV": 1}
+_NUMBERED_ANEW = ("val", "test", "test_obs")
+"""The official splits whose sequences have numbers that others have in `train`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,13 @@ class Argoverse1Reader:
         folder = _map_folder(self.maps, path.parent)
         city = _city(path, columns)
         yield _recording(path, columns, None if folder is None else _city_lanes(folder, city))
+
+
+def _group(path: Path) -> str:
+    """A sequence's number, with its split before it, as the folder has it (`val/data/7.csv`)."""
+    folder = path.absolute().parent
+    split = folder.parent.name if folder.name == "data" else folder.name
+    return f"{split}/{path.stem}" if split in _NUMBERED_ANEW else path.stem
 
 
 def _csv_files(path: Path) -> list[str]:
@@ -155,7 +164,7 @@ def _recording(path: Path, columns: Columns, lanes: LaneMap | None) -> Recording
         raise LogError(f"{path}: {focal.sum()} tracks of type AGENT, expected 1")
     return Recording(
         name=path.stem,
-        group=path.stem,
+        group=_group(path),
         dt_s=DT_S,
         tracks=_grid(path, columns, order),
         track_ids=tuple(order),

@@ -9,7 +9,6 @@ centerlines around the target in the same way and frame; successors are inferred
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from eqrt.core.errors import LogError
 from eqrt.core.lanes import Lane, LaneMap, arclength, build_lane_map, evenly_spaced
 from eqrt.training.recordings.recording import Part, Recording, Source, TrackGrid
+from eqrt.training.recordings.recording_file import UNREADABLE
 
 Float64 = NDArray[np.float64]
 Arrays = dict[str, NDArray[np.generic]]
@@ -38,18 +38,18 @@ NOW_STEP = 19
 SAME_POINT_M = 0.6
 """A lane follows another if it begins within this distance of the other's end."""
 SCENES_PER_PART = 32
-_NEEDED = {
-    "seq_id": 1,
-    "orig": 2,
-    "scene_track_ptr": 1,
-    "track_pt_ptr": 1,
-    "track_xy": 2,
-    "track_step": 1,
-    "scene_lane_ptr": 1,
-    "lane_pt_ptr": 1,
-    "lane_xy": 2,
+_NEEDED: dict[str, tuple[int, ...]] = {
+    "seq_id": (),
+    "orig": (2,),
+    "scene_track_ptr": (),
+    "track_pt_ptr": (),
+    "track_xy": (2,),
+    "track_step": (),
+    "scene_lane_ptr": (),
+    "lane_pt_ptr": (),
+    "lane_xy": (2,),
 }
-"""Array -> its number of axes."""
+"""Array -> the shape of each of its entries."""
 
 
 class PackedArgoverse1Reader:
@@ -83,7 +83,10 @@ def _arrays(path: str) -> Arrays:
     """The arrays of one file, their sizes checked."""
     try:
         # Opened here: np.load leaves a file that it cannot read open.
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        with Path(path).open("rb") as stream:
+            file = np.load(stream, allow_pickle=False)
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise ValueError("it holds a single array")
             missing = sorted(set(_NEEDED) - set(file.files))
             if missing:
                 raise LogError(
@@ -92,18 +95,19 @@ def _arrays(path: str) -> Arrays:
             arrays = {name: file[name] for name in _NEEDED}
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such file") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise LogError(f"{path}: not a readable .npz file ({error})") from error
     _check(arrays, path)
     return arrays
 
 
 def _check(arrays: Arrays, path: str) -> None:
-    for name, axes in _NEEDED.items():
-        if arrays[name].ndim != axes or arrays[name].dtype.kind not in "iuf":
+    for name, entry in _NEEDED.items():
+        shape, kind = arrays[name].shape, arrays[name].dtype
+        if not shape or shape[1:] != entry or kind.kind not in "iuf":
             raise LogError(
-                f"{path}: {name} is {arrays[name].dtype} with {arrays[name].ndim} axes, expected "
-                f"numbers with {axes}; the file is damaged"
+                f"{path}: {name} is {kind} of shape {shape}, expected numbers of shape "
+                f"{('n', *entry)}; the file is damaged"
             )
     scenes = len(arrays["seq_id"])
     for pointer, owners, owned in (
@@ -138,6 +142,8 @@ def _recording(arrays: Arrays, scene: int, where: str) -> Recording:
         step = arrays["track_step"][begin:end].astype(np.int64)
         if len(step) and not 0 <= step.min() <= step.max() < NUM_STEPS:
             raise LogError(f"{where}: a step of track {row} is not within 0 to {NUM_STEPS - 1}")
+        if len(np.unique(step)) != len(step):
+            raise LogError(f"{where}: track {row} is seen twice at one step")
         tracks.positions[row, step] = arrays["track_xy"][begin:end] + origin
         tracks.valid[row, step] = True
     if not np.isfinite(tracks.positions).all():
@@ -161,6 +167,8 @@ def _lanes(arrays: Arrays, scene: int, origin: Float64, where: str) -> LaneMap |
     first, last = (int(i) for i in arrays["scene_lane_ptr"][scene : scene + 2])
     starts = arrays["lane_pt_ptr"][first : last + 1].astype(np.int64)
     lines = [arrays["lane_xy"][a:b].astype(np.float64) for a, b in pairwise(starts)]
+    if not all(np.isfinite(line).all() for line in lines):
+        raise LogError(f"{where}: a point of a lane is not a number")
     lines = [line for line in lines if len(line) > 1 and arclength(line)[-1] > SAME_POINT_M]
     if not lines:
         return None

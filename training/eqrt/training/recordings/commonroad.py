@@ -153,6 +153,7 @@ _LANE_TYPES = {
     "crosswalk": LaneType.PEDESTRIAN,
     "busLane": LaneType.BUS,
 }
+_LAST_STEP = np.iinfo(np.int32).max
 _NOT_FOR_VEHICLES = {LaneType.BICYCLE, LaneType.PEDESTRIAN}
 _SPEED_SIGNS = {"R2-1", "274", "274.1"}  # maximum speed in the USA and in Germany; value in m/s
 
@@ -194,6 +195,8 @@ def _track(element: ElementTree.Element) -> Track:
     step = np.array([_exact(state, "time", what) for state in states])
     if not len(step) or (np.diff(step) <= 0).any() or (step % 1 != 0).any():
         raise _MalformedError(f"{what} has no states, or their times do not rise in whole steps")
+    if np.abs(step).max() > _LAST_STEP:
+        raise _MalformedError(f"{what}: a time is beyond {_LAST_STEP} steps")
     length_m, width_m = _size(element, what)
     return Track(
         track_id=_identity(element.get("id"), what),

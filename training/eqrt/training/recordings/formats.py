@@ -173,7 +173,10 @@ def find_format(path: Path, name: str | None, formats: Sequence[Format] = FORMAT
         found = next((kind for kind in formats if kind.fits(path)), None)
         if found is None:
             expected = "; ".join(f"{kind.name}: {kind.holds}" for kind in formats)
-            raise EqrtError(f"{path}: no recorded traffic that is read here; expected {expected}")
+            more = "; CAN logs are read by `eqrt prepare` first" if formats is FORMATS else ""
+            raise EqrtError(
+                f"{path}: no recorded traffic that is read here; expected {expected}{more}"
+            )
         return found
     named = next((kind for kind in formats if kind.name == name), None)
     if named is None:

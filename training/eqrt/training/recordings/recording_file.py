@@ -47,7 +47,7 @@ _ARRAYS = {  # name -> (kind, axes)
     "focal": (np.bool_, 1),
 }
 _TEXTS = ("name", "group", "dt_s", "now_steps", "track_ids", "source", "tile")
-_UNREADABLE = (  # what numpy, zipfile and json raise for files that are damaged or others'
+UNREADABLE = (  # what numpy, zipfile and json raise for files that are damaged or others'
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError),
     *(RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error),
 )
@@ -227,7 +227,7 @@ def _archive(path: Path) -> Iterator[Any]:
             yield archive
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such recording") from error
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise LogError(
             f"{path}: not a whole recording ({error}); make it again, or copy it again"
         ) from error
