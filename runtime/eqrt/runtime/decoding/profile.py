@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from eqrt.core.errors import ProfileError
+from eqrt.core.files import may_be_file
 from eqrt.runtime.decoding import dbc_files, toml_tables
 from eqrt.runtime.decoding.dbc_files import Dbc, load_dbc, parse_dbc
 from eqrt.runtime.decoding.ego_profile import EgoProfile, bind_ego
@@ -170,7 +171,7 @@ def _path(name_or_path: str) -> Path:
     path = Path(name_or_path)
     if path.suffix != ".toml" and path.name == name_or_path:
         path = _PROFILES / f"{name_or_path}.toml"
-    if path.is_file():
+    if may_be_file(path):
         return path
     known = ", ".join(builtin_profiles())
     raise ProfileError(
@@ -181,7 +182,7 @@ def _path(name_or_path: str) -> Path:
 def _dbc_path(name: str, profile: Path) -> Path:
     """The DBC that a profile names: beside the profile, or one of ours."""
     for path in (profile.parent / name, _DBCS / name):
-        if path.is_file():
+        if may_be_file(path):
             return path
     known = ", ".join(sorted(str(path.relative_to(_DBCS)) for path in _DBCS.rglob("*.dbc")))
     raise ProfileError(
