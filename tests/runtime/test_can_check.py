@@ -131,6 +131,12 @@ def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
         ),
         (
             "toyota-rav4",
+            '"wheels.WHEEL_SPEED_RL"]',
+            '"wheels.WHEEL_SPEED_RL"]\nunit = "mph"',
+            r"toyota: .* stand on the ground .* 0\.622 times .*: km/h taken for mph\?",
+        ),
+        (
+            "toyota-rav4",
             'yaw_rate = "YAW_RATE"',
             'yaw_rate = { signal = "YAW_RATE", sign = -1 }',
             r"toyota: when the car turns, .* of the yaw rate",
