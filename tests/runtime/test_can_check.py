@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import struct
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -311,3 +312,65 @@ def test_a_gap_in_what_is_said_leaves_its_pairs_out() -> None:
     said = np.array([1.0, np.nan, 1.0, 1.0, 1.0])
     found = pairs(time_s, np.zeros(5, np.int64), time_s, said)
     np.testing.assert_allclose(found.said, [1.0])
+
+
+DOUBLES = """VERSION ""
+BU_: X
+BO_ 256 OBJECT: 32 X
+ SG_ X : 0|64@1- (1,0) [0|0] "m" X
+ SG_ Y : 64|64@1- (1,0) [0|0] "m" X
+ SG_ VX : 128|64@1- (1,0) [0|0] "m/s" X
+ SG_ VY : 192|64@1- (1,0) [0|0] "m/s" X
+BO_ 257 EGO: 16 X
+ SG_ SPEED : 0|64@1- (1,0) [0|0] "m/s" X
+ SG_ YAW_RATE : 64|64@1- (1,0) [0|0] "rad/s" X
+SIG_VALTYPE_ 256 X : 2;
+SIG_VALTYPE_ 256 Y : 2;
+SIG_VALTYPE_ 256 VX : 2;
+SIG_VALTYPE_ 256 VY : 2;
+SIG_VALTYPE_ 257 SPEED : 2;
+SIG_VALTYPE_ 257 YAW_RATE : 2;
+"""
+DOUBLES_PROFILE = """description = "doubles"
+[[sensor]]
+name = "doubles"
+bus = "car"
+dbc = "doubles.dbc"
+framing = "single"
+velocity = "relative"
+messages = { object = "OBJECT" }
+fields = { x = "X", y = "Y", velocity_x = "VX", velocity_y = "VY" }
+[[ego]]
+bus = "car"
+dbc = "doubles.dbc"
+messages = { ego = "EGO" }
+fields = { speed = "SPEED", yaw_rate = "YAW_RATE" }
+"""
+
+
+@pytest.mark.parametrize("number", [1e308, 1e160, 1e18])
+@pytest.mark.parametrize("alternates", [False, True])
+def test_numbers_beyond_all_measure_are_found_and_drawn(
+    *, number: float, alternates: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What doubles in the wrong byte order look like."""
+    (tmp_path / "doubles.dbc").write_text(DOUBLES)
+    (tmp_path / "doubles.toml").write_text(DOUBLES_PROFILE)
+    lines = []
+    for i in range(100):
+        value = -number if alternates and i % 2 else number
+        for arbitration_id, count in ((256, 4), (257, 2)):
+            data = struct.pack(f"<{count}d", *[value] * count).hex()
+            lines.append(f"({0.05 * i:.6f}) can0 {arbitration_id:X}##0{data}\n")
+    log, found, pictures = tmp_path / "drive.log", tmp_path / "found.json", tmp_path / "pictures"
+    log.write_text("".join(lines))
+    arguments = ["can", "check", str(log), "--profile", str(tmp_path / "doubles.toml")]
+    assert cli.main([*arguments, "--json", str(found), "--plot", str(pictures)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"doubles: 5 % of the objects are more than 1\.41e\+\d\d m away", said), said
+    assert re.search(r"ego: the speed goes from -?1e\+\d\d to 1e\+\d\d m/s: is the unit", said), (
+        said
+    )
+    assert max(map(len, said.splitlines())) < 200
+    assert json.loads(found.read_text())["sensors"][0]["objects"] == 100
+    assert len(list(pictures.iterdir())) == 4

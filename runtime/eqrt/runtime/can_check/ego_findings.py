@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from eqrt.runtime.can_check.ego_course import EgoCourse
+from eqrt.runtime.can_check.plain import plain
 from eqrt.runtime.can_check.report import Finding, Fit, Values
 from eqrt.runtime.can_check.scale import tells, unit_hint, wrong_factor
 
@@ -30,24 +31,25 @@ def _ego_value_texts(rows: dict[str, Values], course: EgoCourse) -> Iterator[str
         speed.median is not None
         and max(abs(speed.p5 or 0.0), abs(speed.p95 or 0.0)) > _MAX_SPEED_MPS
     ):
-        yield f"the speed goes from {speed.low:.0f} to {speed.high:.0f} m/s: is the unit right?"
+        span = f"{plain(speed.low)} to {plain(speed.high)}"
+        yield f"the speed goes from {span} m/s: is the unit right?"
     if speed.median is not None and speed.median < -2.0:
         yield f"the car mostly drives backward ({speed.median:.1f} m/s): sign, or `reverse`"
     if speed.count >= _FEW and speed.low == speed.high and speed.low:
         yield f"the speed is always {speed.low:g} m/s: is it the right signal?"
-    if yaw.count >= _FEW and yaw.low == yaw.high:
-        yield f"the yaw rate is always {yaw.low:g} deg/s: is it the right signal?"
     if yaw.median is None:
         return
+    if yaw.count >= _FEW and yaw.low == yaw.high:
+        yield f"the yaw rate is always {yaw.low:g} deg/s: is it the right signal?"
     if len(course.speed_s):
         sideways = np.abs(course.yaw_rate_rad_s * course.speed_at(course.yaw_rate_s))
         if (hard := float(np.nanquantile(sideways, 0.95))) > _MAX_LATERAL_MPS2:
             yield (
-                f"speed times yaw rate is {hard:.0f} m/s² and more for 5 % of the time, which no "
+                f"speed times yaw rate is {plain(hard)} m/s² and more for 5 % of the time, which no "
                 "tyre holds: degrees taken for radians, or a wrong unit of the speed?"
             )
     if abs(yaw.median) > 60.0:
-        yield f"the yaw rate is {yaw.median:.0f} deg/s in the middle: is the unit right?"
+        yield f"the yaw rate is {plain(yaw.median)} deg/s in the middle: is the unit right?"
 
 
 def _ego_fit(one: Fit) -> Iterator[str]:
