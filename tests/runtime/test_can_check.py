@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import struct
@@ -247,6 +248,33 @@ def test_another_channel_is_not_read(capsys: pytest.CaptureFixture[str]) -> None
     arguments = ["can", "check", str(LOGS["ars408"]), "--profile", "ars408", "--can", "can7"]
     assert cli.main(arguments) == 1
     assert "wrong_bus 24590" in capsys.readouterr().out
+
+
+def test_a_bus_on_another_channel_than_was_asked_for_is_named() -> None:
+    profile = load_profile("toyota-rav4")
+    asked = {"radar": "can1", "car": "can7"}
+    log = read_log(LOGS["toyota-rav4"])
+    report = check(profile, observe(log, profile, asked), "drive.log", asked).report
+    said = said_about(report)
+    assert "car: its messages come on can0, and none on can7: is it --can car=can0?" in said
+    assert "radar: " not in said
+
+
+@pytest.mark.parametrize("asked", [None, {"radar": "can1"}])
+def test_messages_on_two_channels_are_named_where_none_was_asked_for(
+    asked: dict[str, str | int] | None, tmp_path: Path
+) -> None:
+    once = read_log(LOGS["ars408"])
+    lines = [
+        f"({message.timestamp:.6f}) {name} {message.arbitration_id:03X}#{message.data.hex()}\n"
+        for message in itertools.islice(once, 500)
+        for name in ("can0", "can1")
+    ]
+    (tmp_path / "both.log").write_text("".join(lines))
+    profile = load_profile("ars408")
+    seen = observe(read_log(tmp_path / "both.log"), profile, asked)
+    said = said_about(check(profile, seen, "both.log", asked).report)
+    assert ("Obj_0_Status: comes on can0 and can1, " in said) == (asked is None)
 
 
 def test_the_report_as_text_json_and_pictures(

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from eqrt.runtime.can_check.ego_course import EgoCourse, course_of
 from eqrt.runtime.can_check.ego_findings import ego_findings
-from eqrt.runtime.can_check.message_findings import left_out_findings, message_findings
+from eqrt.runtime.can_check.message_findings import (
+    both_bus_findings,
+    left_out_findings,
+    message_findings,
+    other_bus_findings,
+)
 from eqrt.runtime.can_check.motion import ego_fits, object_fits, share_of_jumps
 from eqrt.runtime.can_check.objects import Objects, classes, gather, object_values, values
 from eqrt.runtime.can_check.observation import Observation
@@ -30,8 +36,13 @@ class Checked:
     course: EgoCourse
 
 
-def check(profile: Profile, seen: Observation, log: str) -> Checked:
-    """Everything that can be said about what was seen."""
+def check(
+    profile: Profile,
+    seen: Observation,
+    log: str,
+    asked: Mapping[str, str | int] | None = None,
+) -> Checked:
+    """Everything that can be said about what was seen, of the channels `asked` for, by bus."""
     course = course_of(seen)
     objects = {sensor.name: _objects(sensor, seen) for sensor in profile.sensors}
     sensors = tuple(
@@ -41,6 +52,7 @@ def check(profile: Profile, seen: Observation, log: str) -> Checked:
     unknown, rest = unknown_messages(profile, seen)
     ego = _ego(seen, course)
     findings: list[Finding] = [*message_findings(rows), *offset_findings(profile, seen)]
+    findings += other_bus_findings(profile, asked, seen) if asked else both_bus_findings(rows)
     findings += left_out_findings(profile, seen.counters)
     for bound, sensor in zip(profile.sensors, sensors, strict=True):
         findings += sensor_findings(sensor, objects[sensor.name], course, bound.mount)

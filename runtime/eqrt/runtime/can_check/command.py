@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
     """Check, and print what was found."""
     log = read_log(args.log)
     profile = load_profile(args.profile)
-    channels = parse_channels(args.can, profile.roles)
-    checked = check(profile, observe(log, profile, channels or None), str(args.log))
+    channels = parse_channels(args.can, profile.roles) or None
+    checked = check(profile, observe(log, profile, channels), str(args.log), channels)
     if log.remark:
         print(f"eqrt: {log.remark}", file=sys.stderr)
     for line in lines(checked.report):

@@ -45,8 +45,8 @@ def _ego_value_texts(rows: dict[str, Values], course: EgoCourse) -> Iterator[str
         sideways = np.abs(course.yaw_rate_rad_s * course.speed_at(course.yaw_rate_s))
         if (hard := float(np.nanquantile(sideways, 0.95))) > _MAX_LATERAL_MPS2:
             yield (
-                f"speed times yaw rate is {plain(hard)} m/s² and more for 5 % of the time, which no "
-                "tyre holds: degrees taken for radians, or a wrong unit of the speed?"
+                f"speed times yaw rate is {plain(hard)} m/s² and more for 5 % of the time, which "
+                "no tyre holds: degrees taken for radians, or a wrong unit of the speed?"
             )
     if abs(yaw.median) > 60.0:
         yield f"the yaw rate is {plain(yaw.median)} deg/s in the middle: is the unit right?"

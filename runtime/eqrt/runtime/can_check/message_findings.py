@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
+from eqrt.runtime.can_check.observation import UNNAMED, Observation
 from eqrt.runtime.can_check.report import Finding, ProfileMessage
+from eqrt.runtime.can_check.traffic import key_of, named_messages
 from eqrt.runtime.decoding.decoder_counters import DecoderCounters
 from eqrt.runtime.decoding.profile import Profile
 
@@ -22,6 +24,34 @@ def message_findings(messages: tuple[ProfileMessage, ...]) -> Iterator[Finding]:
             yield Finding(about=user, text=f"never came: {names}")
     for message in messages:
         yield from _damage(message)
+
+
+def both_bus_findings(messages: tuple[ProfileMessage, ...]) -> Iterator[Finding]:
+    """Messages that come on several channels, where none was asked for with `--can`."""
+    for message in messages:
+        if len(message.channels) > 1:
+            buses = " and ".join(message.channels)
+            yield Finding(
+                about=message.name,
+                text=f"comes on {buses}, and all of it is read; say which is meant with --can "
+                "ROLE=NAME",
+            )
+
+
+def other_bus_findings(
+    profile: Profile, asked: Mapping[str, str | int], seen: Observation
+) -> Iterator[Finding]:
+    """Buses of the profile that are on another channel than was asked for."""
+    for bus, channel in asked.items():
+        keys = {key_of(named.address) for named in named_messages(profile) if named.bus == bus}
+        came = {name for key in keys & seen.streams.keys() for name in seen.streams[key].channels}
+        if came and not came & {str(channel), UNNAMED}:
+            names = sorted(came)
+            yield Finding(
+                about=bus,
+                text=f"its messages come on {' and '.join(names)}, and none on {channel}: is it "
+                f"--can {bus}={names[0]}?",
+            )
 
 
 def left_out_findings(profile: Profile, counters: DecoderCounters) -> Iterator[Finding]:
@@ -46,12 +76,6 @@ def _damage(message: ProfileMessage) -> Iterator[Finding]:
     ):
         if number > max(2, 0.01 * count):
             yield Finding(about=message.name, text=f"{number} of {count} {what}")
-    if len(message.channels) > 1:
-        buses = " and ".join(message.channels)
-        yield Finding(
-            about=message.name,
-            text=f"comes on {buses}: both are read; say which bus is meant with --can ROLE=NAME",
-        )
 
 
 def _listed(names: list[str]) -> str:

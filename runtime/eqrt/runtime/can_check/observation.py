@@ -17,6 +17,8 @@ from eqrt.runtime.decoding.profile import Profile
 MessageKey = tuple[int, bool]
 """Arbitration id, and whether it is of the 29-bit kind."""
 
+UNNAMED = "-"
+"""The channel of a log that does not say which."""
 _AFTER_THE_END_S = 60.0  # longer than any timeout: what is open then is closed
 
 
@@ -92,7 +94,7 @@ def _note(seen: Observation, message: can.Message, decoder: Decoder) -> None:
 
 def channel_name(message: can.Message) -> str:
     """What the recorder called the bus; a dash if it does not say."""
-    return "-" if message.channel is None else str(message.channel)
+    return UNNAMED if message.channel is None else str(message.channel)
 
 
 def _keep(seen: Observation, events: list[Event]) -> None:

@@ -56,7 +56,9 @@ def _speed_texts(rows: dict[str, Values]) -> Iterator[str]:
 def _range_texts(rows: dict[str, Values]) -> Iterator[str]:
     row = rows["range"]
     if row.median is not None and (row.p95 or 0.0) > _MAX_RANGE_M:
-        yield f"5 % of the objects are more than {plain(row.p95)} m away: unit or byte order of x, y"
+        yield (
+            f"5 % of the objects are more than {plain(row.p95)} m away: unit or byte order of x, y"
+        )
     if row.median is not None and row.count >= _FEW and (row.p95 or 0.0) < 2.0:
         yield f"95 % of the objects are nearer than {row.p95:.2f} m: is the unit right?"
 

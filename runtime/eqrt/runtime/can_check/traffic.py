@@ -22,6 +22,8 @@ class Named:
     """A message of the profile, and who reads it."""
 
     address: Address
+    bus: str
+    """The role of the bus that it is on."""
     user: str
     optional: bool
 
@@ -30,13 +32,13 @@ def named_messages(profile: Profile) -> Iterator[Named]:
     """Every message of the profile, in its order; one that several read comes several times."""
     for sensor in profile.sensors:
         if sensor.header is not None:
-            yield Named(sensor.header.address, sensor.name, optional=False)
+            yield Named(sensor.header.address, sensor.bus, sensor.name, optional=False)
         for part in sensor.parts:
             for address in part.addresses:
-                yield Named(address, sensor.name, part.optional)
+                yield Named(address, sensor.bus, sensor.name, part.optional)
     for ego in profile.ego:
         for ego_part in ego.parts:
-            yield Named(ego_part.address, "ego", optional=False)
+            yield Named(ego_part.address, ego.bus, "ego", optional=False)
 
 
 def key_of(address: Address) -> MessageKey:
