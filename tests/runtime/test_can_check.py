@@ -323,6 +323,16 @@ def test_a_file_that_cannot_be_written_is_one_line(
     assert capsys.readouterr().err.startswith("eqrt: cannot write ")
 
 
+@pytest.mark.parametrize("name", ["front/left", "../front", "/front"])
+def test_the_pictures_of_a_sensor_stay_in_the_folder(name: str, tmp_path: Path) -> None:
+    profile = broken(tmp_path, "ars408", 'name = "ars408"', f'name = "{name}"')
+    pictures = tmp_path / "pictures"
+    arguments = ["can", "check", str(LOGS["ars408"]), "--profile", profile]
+    assert cli.main([*arguments, "--plot", str(pictures)]) == 0
+    assert len(list(pictures.iterdir())) == 4
+    assert all(path.name.endswith(".svg") for path in pictures.iterdir())
+
+
 def test_two_tracks_are_never_compared_with_each_other() -> None:
     time_s = np.array([0.0, 0.5, 1.0, 0.0, 0.5, 1.0])
     track = np.array([0, 0, 0, 1, 1, 1])
