@@ -7,7 +7,7 @@ sensor by name: what is loaded here is all it goes by.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -57,8 +57,12 @@ class Profile:
     @property
     def ids(self) -> frozenset[tuple[int, bool]]:
         """The same, and whether each is an extended one."""
-        addresses = [part.address for ego in self.ego for part in ego.parts]
-        for sensor in self.sensors:
+        return self.ids_on(self.roles)
+
+    def ids_on(self, buses: Collection[str]) -> frozenset[tuple[int, bool]]:
+        """Those of some of its buses, by their roles."""
+        addresses = [part.address for ego in self.ego if ego.bus in buses for part in ego.parts]
+        for sensor in (sensor for sensor in self.sensors if sensor.bus in buses):
             addresses += [address for part in sensor.parts for address in part.addresses]
             addresses += [sensor.header.address] if sensor.header else []
         return frozenset((address.arbitration_id, address.is_extended) for address in addresses)
