@@ -9,6 +9,7 @@ import struct
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
@@ -275,6 +276,17 @@ def test_messages_on_two_channels_are_named_where_none_was_asked_for(
     seen = observe(read_log(tmp_path / "both.log"), profile, asked)
     said = said_about(check(profile, seen, "both.log", asked).report)
     assert ("Obj_0_Status: comes on can0 and can1, " in said) == (asked is None)
+
+
+def test_a_log_of_two_goes_back_once_and_one_without_times_is_named() -> None:
+    profile = load_profile("ars408")
+    messages = list(itertools.islice(read_log(LOGS["ars408"]), 500))
+    twice = observe([*messages, *messages], profile)
+    assert "log: its clock goes back once: " in said_about(check(profile, twice, "log").report)
+    at_once = [can.Message(0.0, m.arbitration_id, False, data=m.data) for m in messages]
+    seen = observe(at_once, profile)
+    said = said_about(check(profile, seen, "log").report)
+    assert "log: all its messages carry the same time: " in said
 
 
 def test_the_report_as_text_json_and_pictures(

@@ -11,6 +11,7 @@ from eqrt.runtime.can_check.ego_course import EgoCourse, course_of
 from eqrt.runtime.can_check.ego_findings import ego_findings
 from eqrt.runtime.can_check.message_findings import (
     both_bus_findings,
+    clock_findings,
     left_out_findings,
     message_findings,
     other_bus_findings,
@@ -57,9 +58,7 @@ def check(
     for bound, sensor in zip(profile.sensors, sensors, strict=True):
         findings += sensor_findings(sensor, objects[sensor.name], course, bound.mount)
     findings += ego_findings(ego.values, ego.fits, course)
-    if seen.backward_steps:
-        text = f"its clock goes back {seen.backward_steps} times: was it recorded in one piece?"
-        findings.append(Finding(about="log", text=text))
+    findings += clock_findings(seen)
     report = Report(
         schema=SCHEMA,
         log=log,

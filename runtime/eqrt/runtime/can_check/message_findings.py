@@ -54,6 +54,20 @@ def other_bus_findings(
             )
 
 
+def clock_findings(seen: Observation) -> Iterator[Finding]:
+    """A clock that goes back, or does not go at all."""
+    if steps := seen.backward_steps:
+        times = "once" if steps == 1 else f"{steps} times"
+        text = f"its clock goes back {times}: was it recorded in one piece?"
+        yield Finding(about="log", text=text)
+    elif seen.counters.messages > 1 and not seen.seconds:
+        yield Finding(
+            about="log",
+            text="all its messages carry the same time: nothing that moves can be checked, and "
+            "`eqrt replay` predicts at that one time only",
+        )
+
+
 def left_out_findings(profile: Profile, counters: DecoderCounters) -> Iterator[Finding]:
     """Objects that were announced and do not count; empty slots of a radar with slots are none."""
     if any(sensor.framing != "counted" for sensor in profile.sensors):

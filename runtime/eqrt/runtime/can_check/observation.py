@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -63,12 +64,13 @@ def observe(
     """Decode a log on its own clock, as `eqrt replay` does. `channels`: as of `Decoder`."""
     decoder = Decoder(profile, channels)
     seen = Observation(decoder.counters)
+    before_s = -math.inf
     for message in messages:
         now_s = message.timestamp
         if seen.counters.messages == 0:
             seen.first_s = seen.last_s = now_s
-        seen.backward_steps += now_s < seen.last_s
-        seen.last_s = max(seen.last_s, now_s)
+        seen.backward_steps += now_s < before_s
+        seen.last_s, before_s = max(seen.last_s, now_s), now_s
         _keep(seen, decoder.poll(now_s))
         _note(seen, message, decoder)
     _keep(seen, decoder.poll(seen.last_s + _AFTER_THE_END_S))
