@@ -200,6 +200,24 @@ def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
         ),
         (
             "generic",
+            'yaw = "yaw.YAW"',
+            'yaw = { signal = "yaw.QUALITY", unit = "rad" }',
+            r"ego: the poses do not change as the yaw rate says",
+        ),
+        (
+            "generic",
+            "hold_s = 0.02 ",
+            "hold_s = 0.0001 ",
+            r"ego: there is no pose, although EGO_YAW came: .*hold_s is shorter than",
+        ),
+        (
+            "ars408",
+            'speed = "RadarDevice_Speed"',
+            'speed = { signal = "RadarDevice_Speed", when = "RadarDevice_Speed > 1000" }',
+            r"ego: there is no speed, although SpeedInformation came: `valid` or `when` never",
+        ),
+        (
+            "generic",
             'yaw_rate = { signal = "YAW_RATE"',
             'yaw_rate = { sign = -1, signal = "YAW_RATE"',
             r"generic: when the car turns, .* of the yaw rate",

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from eqrt.runtime.can_check.ego_course import EgoCourse, course_of
-from eqrt.runtime.can_check.ego_findings import ego_findings
+from eqrt.runtime.can_check.ego_findings import ego_findings, untold_findings
 from eqrt.runtime.can_check.message_findings import (
     both_bus_findings,
     clock_findings,
@@ -58,6 +58,7 @@ def check(
     for bound, sensor in zip(profile.sensors, sensors, strict=True):
         findings += sensor_findings(sensor, objects[sensor.name], course, bound.mount)
     findings += ego_findings(ego.values, ego.fits, course)
+    findings += untold_findings(profile, asked, seen, course)
     findings += clock_findings(seen)
     report = Report(
         schema=SCHEMA,

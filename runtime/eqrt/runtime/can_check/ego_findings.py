@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from eqrt.runtime.can_check.ego_course import EgoCourse
+from eqrt.runtime.can_check.observation import Observation
 from eqrt.runtime.can_check.plain import plain
 from eqrt.runtime.can_check.report import Finding, Fit, Values
-from eqrt.runtime.can_check.scale import tells, unit_hint, wrong_factor
+from eqrt.runtime.can_check.scale import MIN_PAIRS, tells, unit_hint, wrong_factor
+from eqrt.runtime.can_check.traffic import has_come
+from eqrt.runtime.decoding.profile import Profile
 
 _MAX_SPEED_MPS, _MAX_LATERAL_MPS2 = 90.0, 12.0
 _FEW = 30
+_CLEAR = 1.0  # m/s, deg/s: a car that accelerates or turns, and no noise
 
 
 def ego_findings(
@@ -52,7 +56,28 @@ def _ego_value_texts(rows: dict[str, Values], course: EgoCourse) -> Iterator[str
         yield f"the yaw rate is {plain(yaw.median)} deg/s in the middle: is the unit right?"
 
 
+def untold_findings(
+    profile: Profile, asked: Mapping[str, str | int] | None, seen: Observation, course: EgoCourse
+) -> Iterator[Finding]:
+    """What an `[[ego]]` gives and never told, although its messages came."""
+    told = {"speed": course.speed_s, "yaw rate": course.yaw_rate_s, "pose": course.pose_s}
+    for ego in profile.ego:
+        if not all(has_come(part.address, (asked or {}).get(ego.bus), seen) for part in ego.parts):
+            continue
+        gives = {"speed": "speed" in ego.numbers, "yaw rate": "yaw_rate" in ego.numbers}
+        gives["pose"] = bool(ego.pose_columns)
+        for what in (what for what in gives if gives[what] and not len(told[what])):
+            yield Finding(
+                about="ego",
+                text=f"there is no {what}, although {ego.name.removeprefix('ego ')} came: `valid` "
+                "or `when` never holds"
+                + (", or hold_s is shorter than its messages are apart" if ego.parts[1:] else ""),
+            )
+
+
 def _ego_fit(one: Fit) -> Iterator[str]:
+    if one.pairs >= MIN_PAIRS and one.spread >= _CLEAR and abs(one.correlation or 0.0) <= 0.3:
+        yield f"the poses do not change as the {one.what} says: another signal, or byte order"
     if not tells(one) or one.correlation is None or one.slope is None:
         return
     if one.correlation < -0.3:

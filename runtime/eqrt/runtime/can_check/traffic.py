@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.runtime.can_check.observation import MessageKey, Observation, Stream
+from eqrt.runtime.can_check.observation import UNNAMED, MessageKey, Observation, Stream
 from eqrt.runtime.can_check.report import Channel, ProfileMessage, Rhythm, UnknownMessage
 from eqrt.runtime.decoding.addresses import Address
 from eqrt.runtime.decoding.profile import Profile
@@ -44,6 +44,13 @@ def named_messages(profile: Profile) -> Iterator[Named]:
 def key_of(address: Address) -> MessageKey:
     """As in `Observation.streams`."""
     return address.arbitration_id, address.is_extended
+
+
+def has_come(address: Address, channel: str | int | None, seen: Observation) -> bool:
+    """Whether the message came, on that channel; None = on any."""
+    stream = seen.streams.get(key_of(address), Stream())
+    names = stream.channels.keys() if channel is None else {str(channel), UNNAMED}
+    return bool(names & stream.channels.keys())
 
 
 def profile_messages(profile: Profile, seen: Observation) -> tuple[ProfileMessage, ...]:
