@@ -20,6 +20,7 @@ from eqrt.runtime.can_check.check import check
 from eqrt.runtime.can_check.motion import fit, pairs
 from eqrt.runtime.can_check.observation import observe
 from eqrt.runtime.can_check.report import Report
+from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from source_tree import ROOT
 
@@ -294,6 +295,20 @@ def test_messages_on_two_channels_are_named_where_none_was_asked_for(
     seen = observe(read_log(tmp_path / "both.log"), profile, asked)
     said = said_about(check(profile, seen, "both.log", asked).report)
     assert ("Obj_0_Status: comes on can0 and can1, " in said) == (asked is None)
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 5.0])
+def test_a_car_that_stands_need_not_turn(speed_mps: float) -> None:
+    profile = load_profile("generic")
+    messages = [
+        message
+        for i in range(50)
+        for message in encode_cycle(
+            timestamp_s=0.1 * i, counter=i, speed_mps=speed_mps, yaw_rate_rad_s=0.0
+        )
+    ]
+    said = said_about(check(profile, observe(messages, profile), "drive.log").report)
+    assert ("the yaw rate is always 0 deg/s" in said) == bool(speed_mps)
 
 
 def test_a_log_of_two_goes_back_once_and_one_without_times_is_named() -> None:

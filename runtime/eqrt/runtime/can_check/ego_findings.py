@@ -16,6 +16,7 @@ from eqrt.runtime.decoding.profile import Profile
 
 _MAX_SPEED_MPS, _MAX_LATERAL_MPS2 = 90.0, 12.0
 _FEW = 30
+_STANDING_MPS = 0.5
 _CLEAR = 1.0  # m/s, deg/s: a car that accelerates or turns, and no noise
 
 
@@ -43,7 +44,7 @@ def _ego_value_texts(rows: dict[str, Values], course: EgoCourse) -> Iterator[str
         yield f"the speed is always {speed.low:g} m/s: is it the right signal?"
     if yaw.median is None:
         return
-    if yaw.count >= _FEW and yaw.low == yaw.high:
+    if yaw.count >= _FEW and yaw.low == yaw.high and not _stands(speed):
         yield f"the yaw rate is always {yaw.low:g} deg/s: is it the right signal?"
     if len(course.speed_s):
         sideways = np.abs(course.yaw_rate_rad_s * course.speed_at(course.yaw_rate_s))
@@ -54,6 +55,11 @@ def _ego_value_texts(rows: dict[str, Values], course: EgoCourse) -> Iterator[str
             )
     if abs(yaw.median) > 60.0:
         yield f"the yaw rate is {plain(yaw.median)} deg/s in the middle: is the unit right?"
+
+
+def _stands(speed: Values) -> bool:
+    """Whether the car is known not to have moved: then many a yaw rate is 0 to the last bit."""
+    return speed.high is not None and max(abs(speed.low or 0.0), abs(speed.high)) < _STANDING_MPS
 
 
 def untold_findings(
