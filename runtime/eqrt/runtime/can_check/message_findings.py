@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from eqrt.runtime.can_check.observation import UNNAMED, Observation
 from eqrt.runtime.can_check.report import Finding, ProfileMessage
@@ -22,20 +22,19 @@ def message_findings(messages: tuple[ProfileMessage, ...]) -> Iterator[Finding]:
         elif absent:
             names = _listed([f"{m.name} ({m.id})" for m in absent])
             yield Finding(about=user, text=f"never came: {names}")
-    for message in messages:
-        yield from _damage(message)
+    for user in dict.fromkeys(message.used_by for message in messages):
+        yield from _damage([message for message in messages if message.used_by == user])
 
 
 def both_bus_findings(messages: tuple[ProfileMessage, ...]) -> Iterator[Finding]:
     """Messages that come on several channels, where none was asked for with `--can`."""
-    for message in messages:
-        if len(message.channels) > 1:
-            buses = " and ".join(message.channels)
-            yield Finding(
-                about=message.name,
-                text=f"comes on {buses}, and all of it is read; say which is meant with --can "
-                "ROLE=NAME",
-            )
+    several = [message for message in messages if len(message.channels) > 1]
+    for channels in dict.fromkeys(message.channels for message in several):
+        yield Finding(
+            about=_listed([message.name for message in several if message.channels == channels]),
+            text=f"on {' and '.join(channels)}, and all of it is read; say which is meant with "
+            "--can ROLE=NAME",
+        )
 
 
 def other_bus_findings(
@@ -81,15 +80,33 @@ def left_out_findings(profile: Profile, counters: DecoderCounters) -> Iterator[F
         )
 
 
-def _damage(message: ProfileMessage) -> Iterator[Finding]:
-    count = message.rhythm.count
-    for number, what in (
-        (message.short, "are too short for what the profile reads of them; is this the right DBC?"),
-        (message.bad_checksum, "fail their checksum; if all do, its kind or byte is wrong"),
-        (message.bad_counter, "do not follow in the counter: lost messages, or the wrong signal"),
+def _damage(messages: Sequence[ProfileMessage]) -> Iterator[Finding]:
+    """One finding for all that have the same damage: a radar has up to 256 slots."""
+    for numbers, what in (
+        (
+            [message.short for message in messages],
+            "are too short for what the profile reads of them; is this the right DBC?",
+        ),
+        (
+            [message.bad_checksum for message in messages],
+            "fail their checksum; if all do, its kind or byte is wrong",
+        ),
+        (
+            [message.bad_counter for message in messages],
+            "do not follow in the counter: lost messages, or the wrong signal",
+        ),
     ):
-        if number > max(2, 0.01 * count):
-            yield Finding(about=message.name, text=f"{number} of {count} {what}")
+        bad = [
+            (message, number)
+            for message, number in zip(messages, numbers, strict=True)
+            if number > max(2, 0.01 * message.rhythm.count)
+        ]
+        if bad:
+            yield Finding(
+                about=_listed([message.name for message, _ in bad]),
+                text=f"{sum(number for _, number in bad)} of "
+                f"{sum(message.rhythm.count for message, _ in bad)} {what}",
+            )
 
 
 def _listed(names: list[str]) -> str:
