@@ -232,8 +232,12 @@ def test_sigterm_ends_the_command_cleanly(tmp_path: Path) -> None:
     )
 
 
-def test_a_log_of_which_nothing_is_sent_is_no_success(capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--can-interface", LOCAL, "--speed", "0"]
+@pytest.mark.parametrize("more", [[], ["--loop"]])
+def test_a_log_of_which_nothing_is_sent_is_no_success(
+    more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And it ends."""
+    options = ["--can-interface", LOCAL, "--speed", "0", *more]
     assert main(["play", str(SRR520), "--can", f"can7={next(CHANNELS)}", *options]) == 1
     said = capsys.readouterr().out
     assert said.startswith("eqrt play: sent 0 messages")

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         player.play(log, should_stop)
         if log.remark:
             print(f"eqrt: {log.remark}", file=sys.stderr)
-        while args.loop and not should_stop():
+        while args.loop and player.sent and not should_stop():
             if args.speed and not player.lasted_s:
                 raise UsageError(
                     f"--loop: all messages of {args.log} carry the same time, which does not say "
