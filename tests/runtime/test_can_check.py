@@ -255,6 +255,15 @@ def test_a_sensor_with_other_ids_is_found(tmp_path: Path) -> None:
     assert report.decoded  # the ego's speed and yaw rate are
 
 
+def test_the_ids_of_the_ego_are_no_sensor_with_other_ids() -> None:
+    """A car that sends 0x300 and 0x301, and a radar that is off: 0x60A and 0x60B it is not."""
+    profile = load_profile("ars408")
+    car = [m for m in itertools.islice(read_log(LOGS["ars408"]), 500) if m.arbitration_id < 0x302]
+    said = said_about(check(profile, observe(car, profile), "drive.log").report)
+    assert "ars408: none of its messages came: Obj_0_Status" in said
+    assert "the same pattern of ids" not in said
+
+
 def test_the_wrong_profile_decodes_nothing_and_the_status_says_so(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
