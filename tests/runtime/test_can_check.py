@@ -251,7 +251,7 @@ def test_a_sensor_with_other_ids_is_found(tmp_path: Path) -> None:
     )
     report = report_of(profile, LOGS["ars408"])
     assert "ars408: none of its messages came: Obj_0_Status (0x61A)" in said_about(report)
-    assert "ars408: the same pattern of ids is there 0x10 lower: add -0x10" in said_about(report)
+    assert "ars408: the same pattern of ids is there 0x10 lower: add -16 " in said_about(report)
     assert report.decoded  # the ego's speed and yaw rate are
 
 

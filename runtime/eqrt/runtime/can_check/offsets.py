@@ -23,7 +23,7 @@ def offset_findings(profile: Profile, seen: Observation) -> Iterator[Finding]:
             yield Finding(
                 about=sensor.name,
                 text=f"the same pattern of ids is there {_shown(offset)}: "
-                f"add {offset:#x} to its arbitration_id_offset, if that is this sensor",
+                f"add {offset} to its arbitration_id_offset, if that is this sensor",
             )
 
 
