@@ -232,6 +232,18 @@ def test_a_broken_mapping_is_named(
     assert re.search(said, said_about(report)), said_about(report)
 
 
+def test_what_is_damaged_is_not_blamed_on_a_condition(tmp_path: Path) -> None:
+    profile = broken(
+        tmp_path,
+        "toyota-rav4",
+        'message = "KINEMATICS"\nchecksum = { kind = "sum8"',
+        'message = "KINEMATICS"\nchecksum = { kind = "xor8", byte = 0',
+    )
+    said = said_about(report_of(profile, LOGS["toyota-rav4"]))
+    assert re.search(r"KINEMATICS: 4\d+ of 4974 fail their checksum", said), said
+    assert "there is no yaw rate" not in said
+
+
 def test_the_wrong_byte_order_is_named(tmp_path: Path) -> None:
     """LONG_DIST read as little-endian: its high byte is then another signal's."""
     dbc = (DECODING / "dbc/opendbc/toyota_adas.dbc").read_text(encoding="latin-1")

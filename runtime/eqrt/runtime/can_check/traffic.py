@@ -47,10 +47,11 @@ def key_of(address: Address) -> MessageKey:
 
 
 def has_come(address: Address, channel: str | int | None, seen: Observation) -> bool:
-    """Whether the message came, on that channel; None = on any."""
+    """Whether the message came, mostly whole, on that channel; None = on any."""
     stream = seen.streams.get(key_of(address), Stream())
     names = stream.channels.keys() if channel is None else {str(channel), UNNAMED}
-    return bool(names & stream.channels.keys())
+    damaged = stream.short + stream.bad_checksum + stream.bad_counter
+    return bool(names & stream.channels.keys()) and 2 * damaged < len(stream.times_s)
 
 
 def profile_messages(profile: Profile, seen: Observation) -> tuple[ProfileMessage, ...]:
