@@ -32,6 +32,7 @@ from eqrt.runtime.replay import replay
 from eqrt.training.recordings.commonroad import Scenario, lane_map, read_scenario
 from eqrt.training.recordings.commonroad_recordings import track_grid
 from eqrt.training.recordings.recording import TrackGrid
+from processes import files_of_at_most
 
 NGSIM = Path(__file__).parent.parent / "data" / "ngsim"
 RANGE_M = 80.0
@@ -192,6 +193,17 @@ def test_a_range_that_the_object_list_cannot_say_is_refused(
     assert main(["encode", *files, "--range", range_m]) == 2
     assert "--range is " in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_log_that_cannot_be_written_is_not_begun(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, tile = tmp_path / "drive.log", tmp_path / "drive.tile"
+    files = [str(NGSIM / "USA_Lanker-1_2_T-1.xml.gz"), "--out", str(out), "--tile", str(tile)]
+    with files_of_at_most(1 << 12):
+        assert main(["encode", *files]) == 1
+    assert capsys.readouterr().err.startswith(f"eqrt: cannot write {out} (")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_one_file_for_log_and_tile_is_refused(

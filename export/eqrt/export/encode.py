@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.files import write_whole
 from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.core.lanes import NO_LANE, LaneMap
 from eqrt.core.tile import TileInfo, encode
@@ -243,7 +244,10 @@ def _yaw_rate(track: Track, row: int, dt_s: float) -> float:
 
 
 def write_candump(path: Path, messages: Sequence[can.Message]) -> None:
-    """A candump log, gzip'd if its name says so; the same messages give the same bytes."""
+    """A candump log, gzip'd if its name says so; the same messages give the same bytes.
+
+    Raises EqrtError if it cannot be written.
+    """
     text = io.StringIO()
     with can.CanutilsLogWriter(text) as writer:
         for message in messages:
@@ -251,4 +255,9 @@ def write_candump(path: Path, messages: Sequence[can.Message]) -> None:
         content = text.getvalue().encode("ascii")
     if path.suffix == ".gz":
         content = gzip.compress(content, mtime=0)
-    path.write_bytes(content)
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        raise EqrtError(
+            f"cannot write {path} ({error.strerror}); give --out a file that can be written"
+        ) from error

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import write_whole
 from eqrt.runtime.bench.json_form import to_json
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _write(path: Path, text: str) -> None:
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode())
     except OSError as error:
         raise EqrtError(
             f"cannot write {path} ({error.strerror}); give --json a file that can be written"

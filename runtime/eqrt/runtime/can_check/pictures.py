@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import write_whole
 from eqrt.core.frames import Pose2
 from eqrt.runtime.can_check.chart import Marks, Panel, figure
 from eqrt.runtime.can_check.check import Checked
@@ -36,7 +37,7 @@ def write_pictures(folder: Path, profile: Profile, checked: Checked) -> list[Pat
         written = []
         for name, text in _pictures(profile, checked):
             path = folder / f"{_NO_PART_OF_A_NAME.sub('-', name)}.svg"
-            path.write_text(text, encoding="utf-8")
+            write_whole(path, text.encode())
             written.append(path)
     except OSError as error:
         raise EqrtError(
