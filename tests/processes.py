@@ -49,6 +49,19 @@ def eqrt(
     )
 
 
+@contextlib.contextmanager
+def files_of_at_most(max_bytes: int) -> Iterator[None]:
+    """As on a disk that is full: this process writes no longer file, OSError. Unix only."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 class Serving:
     """`eqrt serve` in a process, from when it is ready; ended at the end of the `with` block."""
 

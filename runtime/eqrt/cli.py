@@ -116,6 +116,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()  # the reader has gone; there is nobody to tell
         return 1
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"eqrt: cannot use {error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
 
 
 def _run_command(name: str, argv: list[str]) -> int:

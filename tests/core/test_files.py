@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import sys
 from pathlib import Path
 
 import pytest
 
-from eqrt.core.files import read_at_most
+from eqrt.core.files import may_be_file, read_at_most, write_whole
+from processes import files_of_at_most
 
 
 def test_a_file_of_just_the_size_is_read(tmp_path: Path) -> None:
@@ -28,3 +30,28 @@ def test_one_byte_more_is_refused_and_the_sizes_are_told(tmp_path: Path) -> None
 def test_a_missing_file_is_missing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         read_at_most(4, tmp_path / "none")
+
+
+def test_a_folder_or_nothing_is_no_file(tmp_path: Path) -> None:
+    assert not may_be_file(tmp_path)
+    assert not may_be_file(tmp_path / "none")
+    (tmp_path / "some").touch()
+    assert may_be_file(tmp_path / "some")
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason="there, pathlib takes it for no file")
+def test_what_cannot_be_told_may_be_a_file(tmp_path: Path) -> None:
+    assert may_be_file(tmp_path / ("long" * 100))
+
+
+def test_a_file_is_written_whole_or_stays_what_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "found.json"
+    write_whole(path, b"old")
+    with files_of_at_most(1 << 16), pytest.raises(OSError, match="File too large"):
+        write_whole(path, bytes(1 << 17))
+    assert path.read_bytes() == b"old"
+    write_whole(path, b"new")
+    assert path.read_bytes() == b"new"
+    with pytest.raises(IsADirectoryError):
+        write_whole(tmp_path, b"")
+    assert [one.name for one in tmp_path.iterdir()] == ["found.json"]

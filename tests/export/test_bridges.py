@@ -46,7 +46,7 @@ from eqrt.runtime.recording.steps import Lost, TapedClock
 from eqrt.runtime.status_book import StatusBook
 from forecast_sets import nobody, one_car
 from plotjuggler import curves, plotjuggler_server, series
-from processes import PATIENCE_S, Serving, playing
+from processes import PATIENCE_S, Serving, files_of_at_most, playing
 from source_tree import ROOT
 
 NGSIM = DRIVES["ngsim"]
@@ -483,6 +483,18 @@ def test_a_bag_is_not_written_over(
     command = ["convert", str(recording.paths[0]), "--to", "rosbag2", "--out", str(tmp_path)]
     assert main(command) == 2
     assert "a new folder" in capsys.readouterr().err
+
+
+def test_of_a_bag_that_cannot_be_written_nothing_stays(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half a bag would be in the way of the next attempt."""
+    bag = tmp_path / "bag"
+    command = ["convert", str(recording.paths[0]), "--to", "rosbag2", "--out", str(bag)]
+    with files_of_at_most(1 << 12):
+        assert main(command) == 1
+    assert capsys.readouterr().err.startswith(f"eqrt: cannot write {bag} (")
+    assert not bag.exists()
 
 
 @pytest.mark.parametrize("out", ["-", "out.jsonl"])

@@ -8,11 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eqrt.cli import main
 from eqrt.core.contract import ModelContract
+from eqrt.core.errors import EqrtError
 from eqrt.core.routes import RouteFinder
 from eqrt.core.scene import Scene, build_scene, concatenate
 from eqrt.core.tile import TileInfo, decode, encode
-from eqrt.export.encode import ObjectIds, choose_ego, drive_messages, joined, moved, write_candump
+from eqrt.export.encode import (
+    MAX_RANGE_M,
+    ObjectIds,
+    choose_ego,
+    drive_messages,
+    joined,
+    moved,
+    write_candump,
+)
 from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Prediction, Predictor
@@ -22,6 +32,7 @@ from eqrt.runtime.replay import replay
 from eqrt.training.recordings.commonroad import Scenario, lane_map, read_scenario
 from eqrt.training.recordings.commonroad_recordings import track_grid
 from eqrt.training.recordings.recording import TrackGrid
+from processes import files_of_at_most
 
 NGSIM = Path(__file__).parent.parent / "data" / "ngsim"
 RANGE_M = 80.0
@@ -171,3 +182,44 @@ def test_the_same_drive_gives_the_same_bytes(scenario: Scenario, tmp_path: Path)
     for name in ("one.log.gz", "two.log.gz"):
         write_candump(tmp_path / name, list(drive_messages([scenario], RANGE_M)))
     assert (tmp_path / "one.log.gz").read_bytes() == (tmp_path / "two.log.gz").read_bytes()
+
+
+@pytest.mark.parametrize("range_m", ["0", "-3", "nan", "inf", "328"])
+def test_a_range_that_the_object_list_cannot_say_is_refused(
+    range_m: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, tile = tmp_path / "drive.log", tmp_path / "drive.tile"
+    files = [str(NGSIM / "USA_Lanker-1_2_T-1.xml.gz"), "--out", str(out), "--tile", str(tile)]
+    assert main(["encode", *files, "--range", range_m]) == 2
+    assert "--range is " in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_log_that_cannot_be_written_is_not_begun(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, tile = tmp_path / "drive.log", tmp_path / "drive.tile"
+    files = [str(NGSIM / "USA_Lanker-1_2_T-1.xml.gz"), "--out", str(out), "--tile", str(tile)]
+    with files_of_at_most(1 << 12):
+        assert main(["encode", *files]) == 1
+    assert capsys.readouterr().err.startswith(f"eqrt: cannot write {out} (")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_file_for_log_and_tile_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "drive.log")
+    files = [str(NGSIM / "USA_Lanker-1_2_T-1.xml.gz"), "--out", out, "--tile", out]
+    assert main(["encode", *files]) == 2
+    assert "give the tile a name of its own" in capsys.readouterr().err
+
+
+def test_more_objects_than_the_list_takes_are_refused(scenario: Scenario) -> None:
+    tracks = scenario.tracks * (256 // len(scenario.tracks) + 2)
+    crowd = replace(
+        scenario,
+        tracks=tuple(replace(track, track_id=i) for i, track in enumerate(tracks)),
+    )
+    with pytest.raises(EqrtError, match=r"within 327 m of the ego, .* takes 255; give a smaller"):
+        list(drive_messages([crowd], MAX_RANGE_M))

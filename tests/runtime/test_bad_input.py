@@ -110,6 +110,17 @@ CASES: list[tuple[str, int, str]] = [  # command line, status, what is said
         1,
         r"nodbc\.toml: there is no DBC 'missing\.dbc' beside",
     ),
+    (
+        f"can check {'long' * 100}.log --profile ars408",
+        1,
+        r"(cannot read .*File name too long|does not exist; give)",
+    ),
+    (
+        f"serve --can c --profile {'long' * 100}.toml",
+        1,
+        r"(cannot read .*File name too long|no profile 'long.*built in are)",
+    ),
+    (f"replay {LOG} --profile srr520 --out {'long' * 100}", 1, r"cannot .*File name too long"),
     # Models
     (f"{SERVE} --model missing", 1, r"missing/model\.onnx: No such file or directory; a model is"),
     (f"{SERVE} --model file", 1, r"file/model\.onnx: Not a directory; a model is a folder"),

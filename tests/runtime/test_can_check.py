@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
+import struct
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
@@ -17,6 +20,7 @@ from eqrt.runtime.can_check.check import check
 from eqrt.runtime.can_check.motion import fit, pairs
 from eqrt.runtime.can_check.observation import observe
 from eqrt.runtime.can_check.report import Report
+from eqrt.runtime.decoding.generic_objects import encode_cycle
 from eqrt.runtime.decoding.profile import load_profile
 from source_tree import ROOT
 
@@ -131,6 +135,12 @@ def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
         ),
         (
             "toyota-rav4",
+            '"wheels.WHEEL_SPEED_RL"]',
+            '"wheels.WHEEL_SPEED_RL"]\nunit = "mph"',
+            r"toyota: .* stand on the ground .* 0\.622 times .*: km/h taken for mph\?",
+        ),
+        (
+            "toyota-rav4",
             'yaw_rate = "YAW_RATE"',
             'yaw_rate = { signal = "YAW_RATE", sign = -1 }',
             r"toyota: when the car turns, .* of the yaw rate",
@@ -145,7 +155,7 @@ def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
             "toyota-rav4",
             'message = "TRACK_A_{slot}"\ncounter = "COUNTER"\nchecksum = { kind = "sum8"',
             'message = "TRACK_A_{slot}"\ncounter = "COUNTER"\nchecksum = { kind = "xor8"',
-            r"TRACK_A_0: 1\d+ of 1200 fail their checksum",
+            r"TRACK_A_0, TRACK_A_1, TRACK_A_2, TRACK_A_3 and 12 more: 19\d+ of 19200 fail their",
         ),
         (
             "ars408",
@@ -191,6 +201,24 @@ def test_a_gap_and_where_it_is(tmp_path: Path) -> None:
         ),
         (
             "generic",
+            'yaw = "yaw.YAW"',
+            'yaw = { signal = "yaw.QUALITY", unit = "rad" }',
+            r"ego: the poses do not change as the yaw rate says",
+        ),
+        (
+            "generic",
+            "hold_s = 0.02 ",
+            "hold_s = 0.0001 ",
+            r"ego: there is no pose, although EGO_YAW came: .*hold_s is shorter than",
+        ),
+        (
+            "ars408",
+            'speed = "RadarDevice_Speed"',
+            'speed = { signal = "RadarDevice_Speed", when = "RadarDevice_Speed > 1000" }',
+            r"ego: there is no speed, although SpeedInformation came: `valid` or `when` never",
+        ),
+        (
+            "generic",
             'yaw_rate = { signal = "YAW_RATE"',
             'yaw_rate = { sign = -1, signal = "YAW_RATE"',
             r"generic: when the car turns, .* of the yaw rate",
@@ -202,6 +230,18 @@ def test_a_broken_mapping_is_named(
 ) -> None:
     report = report_of(broken(tmp_path, profile, old, new), LOGS[profile])
     assert re.search(said, said_about(report)), said_about(report)
+
+
+def test_what_is_damaged_is_not_blamed_on_a_condition(tmp_path: Path) -> None:
+    profile = broken(
+        tmp_path,
+        "toyota-rav4",
+        'message = "KINEMATICS"\nchecksum = { kind = "sum8"',
+        'message = "KINEMATICS"\nchecksum = { kind = "xor8", byte = 0',
+    )
+    said = said_about(report_of(profile, LOGS["toyota-rav4"]))
+    assert re.search(r"KINEMATICS: 4\d+ of 4974 fail their checksum", said), said
+    assert "there is no yaw rate" not in said
 
 
 def test_the_wrong_byte_order_is_named(tmp_path: Path) -> None:
@@ -223,8 +263,17 @@ def test_a_sensor_with_other_ids_is_found(tmp_path: Path) -> None:
     )
     report = report_of(profile, LOGS["ars408"])
     assert "ars408: none of its messages came: Obj_0_Status (0x61A)" in said_about(report)
-    assert "ars408: the same pattern of ids is there 0x10 lower: add -0x10" in said_about(report)
+    assert "ars408: the same pattern of ids is there 0x10 lower: add -16 " in said_about(report)
     assert report.decoded  # the ego's speed and yaw rate are
+
+
+def test_the_ids_of_the_ego_are_no_sensor_with_other_ids() -> None:
+    """A car that sends 0x300 and 0x301, and a radar that is off: 0x60A and 0x60B it is not."""
+    profile = load_profile("ars408")
+    car = [m for m in itertools.islice(read_log(LOGS["ars408"]), 500) if m.arbitration_id < 0x302]
+    said = said_about(check(profile, observe(car, profile), "drive.log").report)
+    assert "ars408: none of its messages came: Obj_0_Status" in said
+    assert "the same pattern of ids" not in said
 
 
 def test_the_wrong_profile_decodes_nothing_and_the_status_says_so(
@@ -240,6 +289,59 @@ def test_another_channel_is_not_read(capsys: pytest.CaptureFixture[str]) -> None
     arguments = ["can", "check", str(LOGS["ars408"]), "--profile", "ars408", "--can", "can7"]
     assert cli.main(arguments) == 1
     assert "wrong_bus 24590" in capsys.readouterr().out
+
+
+def test_a_bus_on_another_channel_than_was_asked_for_is_named() -> None:
+    profile = load_profile("toyota-rav4")
+    asked = {"radar": "can1", "car": "can7"}
+    log = read_log(LOGS["toyota-rav4"])
+    report = check(profile, observe(log, profile, asked), "drive.log", asked).report
+    said = said_about(report)
+    assert "car: its messages come on can0, and none on can7: is it --can car=can0?" in said
+    assert "radar: " not in said
+
+
+@pytest.mark.parametrize("asked", [None, {"radar": "can1"}])
+def test_messages_on_two_channels_are_named_where_none_was_asked_for(
+    asked: dict[str, str | int] | None, tmp_path: Path
+) -> None:
+    once = read_log(LOGS["ars408"])
+    lines = [
+        f"({message.timestamp:.6f}) {name} {message.arbitration_id:03X}#{message.data.hex()}\n"
+        for message in itertools.islice(once, 500)
+        for name in ("can0", "can1")
+    ]
+    (tmp_path / "both.log").write_text("".join(lines))
+    profile = load_profile("ars408")
+    seen = observe(read_log(tmp_path / "both.log"), profile, asked)
+    said = said_about(check(profile, seen, "both.log", asked).report)
+    assert ("Obj_3_Extended and 2 more: on can0 and can1, " in said) == (asked is None)
+    assert said.count("can0 and can1") == (asked is None)
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 5.0])
+def test_a_car_that_stands_need_not_turn(speed_mps: float) -> None:
+    profile = load_profile("generic")
+    messages = [
+        message
+        for i in range(50)
+        for message in encode_cycle(
+            timestamp_s=0.1 * i, counter=i, speed_mps=speed_mps, yaw_rate_rad_s=0.0
+        )
+    ]
+    said = said_about(check(profile, observe(messages, profile), "drive.log").report)
+    assert ("the yaw rate is always 0 deg/s" in said) == bool(speed_mps)
+
+
+def test_a_log_of_two_goes_back_once_and_one_without_times_is_named() -> None:
+    profile = load_profile("ars408")
+    messages = list(itertools.islice(read_log(LOGS["ars408"]), 500))
+    twice = observe([*messages, *messages], profile)
+    assert "log: its clock goes back once: " in said_about(check(profile, twice, "log").report)
+    at_once = [can.Message(0.0, m.arbitration_id, False, data=m.data) for m in messages]
+    seen = observe(at_once, profile)
+    said = said_about(check(profile, seen, "log").report)
+    assert "log: all its messages carry the same time: " in said
 
 
 def test_the_report_as_text_json_and_pictures(
@@ -288,6 +390,16 @@ def test_a_file_that_cannot_be_written_is_one_line(
     assert capsys.readouterr().err.startswith("eqrt: cannot write ")
 
 
+@pytest.mark.parametrize("name", ["front/left", "../front", "/front"])
+def test_the_pictures_of_a_sensor_stay_in_the_folder(name: str, tmp_path: Path) -> None:
+    profile = broken(tmp_path, "ars408", 'name = "ars408"', f'name = "{name}"')
+    pictures = tmp_path / "pictures"
+    arguments = ["can", "check", str(LOGS["ars408"]), "--profile", profile]
+    assert cli.main([*arguments, "--plot", str(pictures)]) == 0
+    assert len(list(pictures.iterdir())) == 4
+    assert all(path.name.endswith(".svg") for path in pictures.iterdir())
+
+
 def test_two_tracks_are_never_compared_with_each_other() -> None:
     time_s = np.array([0.0, 0.5, 1.0, 0.0, 0.5, 1.0])
     track = np.array([0, 0, 0, 1, 1, 1])
@@ -305,3 +417,67 @@ def test_a_gap_in_what_is_said_leaves_its_pairs_out() -> None:
     said = np.array([1.0, np.nan, 1.0, 1.0, 1.0])
     found = pairs(time_s, np.zeros(5, np.int64), time_s, said)
     np.testing.assert_allclose(found.said, [1.0])
+
+
+DOUBLES = """VERSION ""
+BU_: X
+BO_ 256 OBJECT: 32 X
+ SG_ X : 0|64@1- (1,0) [0|0] "m" X
+ SG_ Y : 64|64@1- (1,0) [0|0] "m" X
+ SG_ VX : 128|64@1- (1,0) [0|0] "m/s" X
+ SG_ VY : 192|64@1- (1,0) [0|0] "m/s" X
+BO_ 257 EGO: 16 X
+ SG_ SPEED : 0|64@1- (1,0) [0|0] "m/s" X
+ SG_ YAW_RATE : 64|64@1- (1,0) [0|0] "rad/s" X
+SIG_VALTYPE_ 256 X : 2;
+SIG_VALTYPE_ 256 Y : 2;
+SIG_VALTYPE_ 256 VX : 2;
+SIG_VALTYPE_ 256 VY : 2;
+SIG_VALTYPE_ 257 SPEED : 2;
+SIG_VALTYPE_ 257 YAW_RATE : 2;
+"""
+DOUBLES_PROFILE = """description = "doubles"
+[[sensor]]
+name = "doubles"
+bus = "car"
+dbc = "doubles.dbc"
+framing = "single"
+velocity = "relative"
+messages = { object = "OBJECT" }
+fields = { x = "X", y = "Y", velocity_x = "VX", velocity_y = "VY" }
+[[ego]]
+bus = "car"
+dbc = "doubles.dbc"
+messages = { ego = "EGO" }
+fields = { speed = "SPEED", yaw_rate = "YAW_RATE" }
+"""
+
+
+@pytest.mark.parametrize("number", [1e308, 1e160, 1e18])
+@pytest.mark.parametrize("alternates", [False, True])
+def test_numbers_beyond_all_measure_are_found_and_drawn(
+    *, number: float, alternates: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What doubles in the wrong byte order look like."""
+    (tmp_path / "doubles.dbc").write_text(DOUBLES)
+    (tmp_path / "doubles.toml").write_text(DOUBLES_PROFILE)
+    lines = []
+    for i in range(100):
+        value = -number if alternates and i % 2 else number
+        for arbitration_id, count in ((256, 4), (257, 2)):
+            data = struct.pack(f"<{count}d", *[value] * count).hex()
+            lines.append(f"({0.05 * i:.6f}) can0 {arbitration_id:X}##0{data}\n")
+    log, found, pictures = tmp_path / "drive.log", tmp_path / "found.json", tmp_path / "pictures"
+    log.write_text("".join(lines))
+    arguments = ["can", "check", str(log), "--profile", str(tmp_path / "doubles.toml")]
+    assert cli.main([*arguments, "--json", str(found), "--plot", str(pictures)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"doubles: 5 % of the objects are more than 1\.41e\+\d\d m away", said), said
+    assert re.search(r"ego: the speed goes from -?1e\+\d\d to 1e\+\d\d m/s: is the unit", said), (
+        said
+    )
+    assert max(map(len, said.splitlines())) < 200
+    assert json.loads(found.read_text())["sensors"][0]["objects"] == 100
+    texts = [path.read_text() for path in pictures.iterdir()]
+    assert len(texts) == 4
+    assert max(len(label) for text in texts for label in re.findall(r">([-\d.,e+]+)<", text)) < 12

@@ -165,6 +165,31 @@ def test_names_of_more_than_32_characters_are_those_of_cantools(tmp_path: Path) 
     }
 
 
+LONG_ID = """BU_: CAR
+BO_ {id} LONG: 8 CAR
+ SG_ KIND M : 0|8@1+ (1,0) [0|0] "" CAR
+ SG_ NUMBER m1 : 8|32@1- (1,0) [0|0] "" CAR
+ SG_ OTHER m2M : 8|8@1+ (1,0) [0|0] "" CAR
+ SG_ NESTED m3 : 16|8@1+ (1,0) [0|0] "" CAR
+BA_ "SystemMessageLongSymbol" BO_ {id} "A_MESSAGE_OF_MORE_THAN_32_CHARACTERS";
+SIG_VALTYPE_ {id} NUMBER : 1;
+SG_MUL_VAL_ {id} NESTED OTHER 3-5;
+"""
+
+
+def test_an_id_of_29_bits_is_one_without_the_bit_that_says_so(tmp_path: Path) -> None:
+    """As in DBCs of opendbc; everything else that speaks of the message finds it as well."""
+    named = {"right.dbc": 0x12DD54A7 | 1 << 31, "without.dbc": 0x12DD54A7}
+    for name, number in named.items():
+        (tmp_path / name).write_text(LONG_ID.format(id=number))
+    right, without = (load_dbc(tmp_path / name).messages for name in named)
+    assert without == right
+    message = without["A_MESSAGE_OF_MORE_THAN_32_CHARACTERS"]
+    assert (message.arbitration_id, message.is_extended) == (0x12DD54A7, True)
+    assert message.signals["NUMBER"].is_float
+    assert message.signals["NESTED"].selected_by == {3, 4, 5}
+
+
 def test_a_short_message_gives_what_is_there() -> None:
     """Four bytes of TRACK_A: distance and counter, no speed, which begins in byte 5."""
     dbc, _ = both(FOLDER / "opendbc" / "toyota_adas.dbc")

@@ -176,6 +176,14 @@ def test_without_an_age_only_the_latency_is_taken_off(tmp_path: Path) -> None:
     assert motion.timestamp_s == pose.timestamp_s == 7.75
 
 
+@pytest.mark.parametrize(("age_s", "told_s"), [(-1e6, 0.0), (-0.5, 0.0), (0.5, -0.5)])
+def test_nothing_is_measured_after_it_came(tmp_path: Path, age_s: float, told_s: float) -> None:
+    """A time ahead of all others would cut the dead reckoning off, and with it every track."""
+    aged = PLACE_IN_MAP.replace('yaw = "C"', 'yaw = "B", age = { signal = "C", unit = "s" }')
+    (pose,) = exact(tmp_path, aged, 1.0, 2.0, age_s)
+    assert pose.timestamp_s == told_s
+
+
 def exact(folder: Path, text: str, *numbers: float) -> list[Event]:
     """What a message with these three numbers tells."""
     decoder = Decoder(profile_of(folder, text, EXACT_DBC))

@@ -17,8 +17,10 @@ import pytest
 from drives import DRIVES, TILE, first_seconds
 from eqrt.runtime.bus.buses import LOCAL, open_bus
 from eqrt.runtime.bus.candump import candump_message
+from eqrt.runtime.decoding.profile import load_profile
 from eqrt.runtime.doctor.bus import (
     Traffic,
+    judge_ids,
     judge_link,
     judge_load,
     judge_room,
@@ -93,6 +95,23 @@ def test_a_radar_that_sends_is_heard_and_known() -> None:
     assert "lanes" in found["tile"].found
     assert other[f"ids {channel}"].verdict is Verdict.WARN
     assert "generic is not for what is on this channel" in other[f"ids {channel}"].advice
+
+
+def test_two_buses_that_were_swapped_are_a_warning() -> None:
+    """The service would use nothing of what comes."""
+    profile = load_profile("toyota-rav4")
+    traffic = Traffic(1.0)
+    for number in (0xAA, 0x24):
+        traffic.add(can.Message(arbitration_id=number, is_extended_id=False))
+    right = judge_ids("ids can0", traffic, profile, ["car"])
+    assert (right.verdict, right.found) == (
+        Verdict.OK,
+        "2 of the profile's 3 for car heard; not 0x3bc",
+    )
+    swapped = judge_ids("ids can0", traffic, profile, ["radar"])
+    assert swapped.verdict is Verdict.WARN
+    assert swapped.found == "0 of the profile's 16 for radar heard, but of those for car"
+    assert judge_ids("ids can0", traffic, profile, ["car", "radar"]).verdict is Verdict.OK
 
 
 def test_a_map_that_the_profile_has_no_poses_for_is_a_warning() -> None:

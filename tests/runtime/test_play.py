@@ -68,7 +68,7 @@ def test_a_log_is_sent_whole_and_in_order(ear: Ear) -> None:
     player.play(log, never)
     for sent, recorded in zip(ear.heard(), log, strict=True):
         assert sent.equals(recorded, timestamp_delta=None, check_channel=False)
-    assert (player.sent, player.not_sent) == (97, 0)
+    assert (player.sent, player.left_out.total()) == (97, 0)
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])
@@ -148,8 +148,8 @@ def test_log_channels_go_where_they_are_sent(ear: Ear) -> None:
     messages = [*at(0.0, 0.0), *at(0.0, channel="can1"), *at(0.0, 0.0, 0.0, channel="can2")]
     player.play(messages, never)
     assert (len(ear.heard()), len(other.heard())) == (2, 1)
-    assert (player.sent, player.not_sent) == (3, 3)
-    assert "3 not sent" in player.summary()
+    assert (player.sent, player.left_out.total()) == (3, 3)
+    assert "; not sent: 3 of the log's channel can2, which no --can names" in player.summary()
     other.close()
 
 
@@ -163,14 +163,15 @@ def test_numbered_channels_are_named_by_their_number(ear: Ear) -> None:
 def test_bus_errors_are_not_sent(ear: Ear) -> None:
     player = Player({OTHERS: ear.bus})
     player.play([can.Message(0.0, 4, is_error_frame=True), *at(0.0)], never)
-    assert (player.sent, player.not_sent) == (1, 1)
+    assert (player.sent, player.left_out) == (1, {"bus errors": 1})
 
 
 def test_can_fd_is_not_sent_on_a_classic_channel() -> None:
     ear = Ear(fd=False)
     player = Player({OTHERS: ear.bus})
     player.play([can.Message(0.0, 4, is_fd=True), *at(0.0)], never)
-    assert (player.sent, player.not_sent) == (1, 1)
+    assert (player.sent, player.left_out.total()) == (1, 1)
+    assert "; not sent: 1 in CAN FD, for a channel" in player.summary()
     ear.close()
 
 
@@ -229,6 +230,30 @@ def test_sigterm_ends_the_command_cleanly(tmp_path: Path) -> None:
         f"eqrt: {path}: lines without a message, skipped: 1 (the first is line 3: 'noise'); "
         "ends in the middle of line 4, read up to there (2 messages)\n"
     )
+
+
+@pytest.mark.parametrize("more", [[], ["--loop"]])
+def test_a_log_of_which_nothing_is_sent_is_no_success(
+    more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And it ends."""
+    options = ["--can-interface", LOCAL, "--speed", "0", *more]
+    assert main(["play", str(SRR520), "--can", f"can7={next(CHANNELS)}", *options]) == 1
+    said = capsys.readouterr().out
+    assert said.startswith("eqrt play: sent 0 messages")
+    assert "not sent: 97 of the log's channel can0, which no --can names" in said
+
+
+@pytest.mark.parametrize("stamps", [(1.0,), (1.0, 1.0)])
+def test_a_log_that_does_not_last_is_not_repeated(
+    stamps: tuple[float, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would fill the bus."""
+    path = tmp_path / "moment.log"
+    path.write_text("".join(f"({stamp:.6f}) can0 123#11\n" for stamp in stamps))
+    options = ["--can", next(CHANNELS), "--can-interface", LOCAL, "--loop"]
+    assert main(["play", str(path), *options]) == 2
+    assert "all messages of" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -246,6 +246,21 @@ def test_a_path_to_nowhere_is_refused() -> None:
         load_profile("/no/such/file.toml")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_files_of_any_editor_are_read(encoding: str, tmp_path: Path) -> None:
+    """With a mark before them, and a degree sign in UTF-8 or in the DBC format's own encoding."""
+    dbc = DBC.replace('"deg"', '"\N{DEGREE SIGN}"')
+    (tmp_path / "tiny.dbc").write_text(dbc, encoding=encoding)
+    toml = "utf-8" if encoding == "cp1252" else encoding
+    polar = f"""{SENSOR}
+framing = "single"
+messages = {{ polar = "POLAR" }}
+fields = {{ range = {{ signal = "RANGE", unit = "m" }}, azimuth = "ANGLE" }}
+"""
+    (tmp_path / "profile.toml").write_text(polar, encoding=toml)
+    assert load_profile(str(tmp_path / "profile.toml")).sensors[0].name == "tiny"
+
+
 @pytest.mark.parametrize("text", ["description = ", "a = 1\na = 2", "\x00", "description = 'x"])
 def test_a_file_that_is_not_toml_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(ProfileError, match=r"tiny.toml is not TOML: "):

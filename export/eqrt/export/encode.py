@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.files import write_whole
 from eqrt.core.frames import Pose2, wrap_angle
 from eqrt.core.lanes import NO_LANE, LaneMap
 from eqrt.core.tile import TileInfo, encode
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
-from eqrt.runtime.decoding.generic_objects import MAX_OBJECT_ID, encode_cycle
+from eqrt.runtime.decoding.generic_objects import MAX_OBJECT_ID, MAX_OBJECTS, encode_cycle
 from eqrt.runtime.prediction.tiles import save_tile
 from eqrt.training.recordings.commonroad import Scenario, Track, lane_map, read_scenario
 
@@ -31,6 +32,8 @@ APART_M = 3000.0
 """Between the scenarios of one drive: no lane or car of one is near another."""
 PAUSE_S = 0.5
 """Between the scenarios, in time."""
+MAX_RANGE_M = 327.0
+"""X and Y have 16 bits of 0.01 m; farther objects would be written nearer than they are."""
 MESSAGE_S = 0.0003
 """A classic message of eight bytes on a bus of 500 kbit/s, and the pause after it."""
 _START_S = 1.7e9  # any wall-clock time; the same for the same drive
@@ -59,6 +62,13 @@ def run(args: argparse.Namespace) -> int:
     """Write both files and say what is in them."""
     if not args.out.name.endswith((".log", ".log.gz")):
         raise UsageError(f"--out {args.out}: a candump log's name ends in .log or .log.gz")
+    if args.out.resolve() == args.tile.resolve():
+        raise UsageError(f"--out and --tile are both {args.out}; give the tile a name of its own")
+    if not 0.0 < args.range <= MAX_RANGE_M:
+        raise UsageError(
+            f"--range is {args.range:g}; give metres above 0 to {MAX_RANGE_M:g}, the farthest that "
+            "the object list can say"
+        )
     scenarios = [
         moved(read_scenario(path), APART_M * index) for index, path in enumerate(args.scenario)
     ]
@@ -173,6 +183,11 @@ def seen_from(
     pose = _pose(ego, int(np.searchsorted(ego.step, step)))
     seen = [s for track in tracks if track is not ego and (s := _Seen.at(track, step)) is not None]
     seen = [s for s in seen if np.hypot(*(s.position - (pose.x_m, pose.y_m))) <= range_m]
+    if len(seen) > MAX_OBJECTS:
+        raise EqrtError(
+            f"{len(seen)} objects are within {range_m:g} m of the ego, and the object list takes "
+            f"{MAX_OBJECTS}; give a smaller --range"
+        )
     object_id, is_new = ids.assign([s.track.track_id for s in seen])
     heading = np.array([s.heading_rad for s in seen])
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
@@ -229,7 +244,10 @@ def _yaw_rate(track: Track, row: int, dt_s: float) -> float:
 
 
 def write_candump(path: Path, messages: Sequence[can.Message]) -> None:
-    """A candump log, gzip'd if its name says so; the same messages give the same bytes."""
+    """A candump log, gzip'd if its name says so; the same messages give the same bytes.
+
+    Raises EqrtError if it cannot be written.
+    """
     text = io.StringIO()
     with can.CanutilsLogWriter(text) as writer:
         for message in messages:
@@ -237,4 +255,9 @@ def write_candump(path: Path, messages: Sequence[can.Message]) -> None:
         content = text.getvalue().encode("ascii")
     if path.suffix == ".gz":
         content = gzip.compress(content, mtime=0)
-    path.write_bytes(content)
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        raise EqrtError(
+            f"cannot write {path} ({error.strerror}); give --out a file that can be written"
+        ) from error

@@ -11,6 +11,7 @@ import contextlib
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import can
@@ -67,10 +68,16 @@ def run(args: argparse.Namespace) -> int:
         player.play(log, should_stop)
         if log.remark:
             print(f"eqrt: {log.remark}", file=sys.stderr)
-        while args.loop and not should_stop():
+        while args.loop and player.sent and not should_stop():
+            if args.speed and not player.lasted_s:
+                raise UsageError(
+                    f"--loop: all messages of {args.log} carry the same time, which does not say "
+                    "when to start again; --speed 0 repeats them as fast as the bus takes them"
+                )
             player.play(log, should_stop)
+        stopped = should_stop()
     print(f"eqrt play: {player.summary()}")
-    return 0
+    return 0 if player.sent or stopped else 1
 
 
 def parse_routes(options: Sequence[str]) -> dict[str, str]:
@@ -96,8 +103,8 @@ class Player:
         self._pace = _Pace(speed)
         self._started_s = time.monotonic()
         self.sent = 0
-        self.not_sent = 0
-        """Bus errors, messages of log channels without a route, CAN FD for a classic channel."""
+        self.left_out: Counter[str] = Counter()
+        """Messages that were not sent, by the reason."""
         self.latest_s = 0.0
         """How long after its time the latest message was sent."""
 
@@ -114,11 +121,15 @@ class Player:
                 return
             bus = self._bus_for(message)
             if bus is None:
-                self.not_sent += 1
                 continue
             self.latest_s = max(self.latest_s, time.monotonic() - due_s)
             send(bus, message, should_stop)
             self.sent += 1
+
+    @property
+    def lasted_s(self) -> float:
+        """From the first message of the log to the last one, as it was played."""
+        return self._pace.lasted_s
 
     def summary(self) -> str:
         """One line for the terminal."""
@@ -127,14 +138,22 @@ class Player:
             parts.append(f"at most {1e3 * self.latest_s:.1f} ms late")
         if self._pace.jumps:
             parts.append(f"{self._pace.jumps} jumps of the log's clock not waited for")
-        if self.not_sent:
-            parts.append(f"{self.not_sent} not sent (bus errors, or not for these channels)")
+        parts += [f"not sent: {number} {reason}" for reason, number in self.left_out.items()]
         return "; ".join(parts)
 
     def _bus_for(self, message: can.Message) -> can.BusABC | None:
+        """None for a message that is left out."""
         bus = self._routes.get(str(message.channel)) or self._routes.get(OTHERS)
-        unfit = message.is_error_frame or (message.is_fd and bus and not carries_fd(bus))
-        return None if unfit else bus
+        if message.is_error_frame:
+            reason = "bus errors"
+        elif bus is None:
+            reason = f"of the log's channel {message.channel}, which no --can names"
+        elif message.is_fd and not carries_fd(bus):
+            reason = "in CAN FD, for a channel that is open for classic CAN"
+        else:
+            return bus
+        self.left_out[reason] += 1
+        return None
 
 
 class _Pace:
@@ -151,6 +170,11 @@ class _Pace:
     def restart(self) -> None:
         """The next message is the first of a log, and due when the one before was."""
         self._start_s, self._first_s, self._last_s = self._due_s, math.nan, math.nan
+
+    @property
+    def lasted_s(self) -> float:
+        """From when the first message of the log was due to when the latest was."""
+        return self._due_s - self._start_s
 
     def due_s(self, timestamp_s: float) -> float:
         """When (monotonic clock) the message stamped `timestamp_s` is to be sent."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -64,8 +65,11 @@ def _rosbag2(recordings: list[Recording], out: str) -> tuple[int, str]:
         raise UsageError(f"--out {out}: a bag is a new folder; give one that does not exist yet")
     try:
         return write_rosbag2(recordings, Path(out)), "messages"
-    except OSError as error:
-        raise EqrtError(f"cannot write {out} ({error.strerror})") from error
+    except BaseException as error:
+        shutil.rmtree(out, ignore_errors=True)  # half a bag is none, and would be in the way
+        if isinstance(error, OSError):
+            raise EqrtError(f"cannot write {out} ({error.strerror})") from error
+        raise
 
 
 def _candump(recordings: list[Recording], out: str) -> tuple[int, str]:

@@ -20,6 +20,7 @@ from typing import IO, BinaryIO, TextIO, cast
 import can
 
 from eqrt.core.errors import LogError
+from eqrt.core.files import may_be_file
 from eqrt.runtime.bus.candump import candump_message
 
 MAX_LINE = 1 << 14
@@ -114,7 +115,7 @@ def read_log(path: str | Path) -> LogReader:
     Raises LogError if there is no such file or its name tells no format.
     """
     path = Path(path)
-    if not path.is_file():
+    if not may_be_file(path):
         found = "is not a file" if path.exists() else "does not exist"
         raise LogError(f"the log {path} {found}; give the path of a recorded CAN log")
     suffix = Path(path.name.lower().removesuffix(".gz")).suffix

@@ -18,6 +18,7 @@ Float64 = NDArray[np.float64]
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 16, 56, 46
 _TITLE = 34
+_LEAST_SHARE = 1e-6  # of the values themselves: an axis shorter than that has no numbers on it
 _STYLE = """
 svg { color-scheme: light dark; --paper: #ffffff; --ink: #1c1f24; --faint: #5d6570;
   --line: #d6dae0; --blue: #0072b2; --orange: #d55e00; --green: #00805c; --grey: #8a929c; }
@@ -110,8 +111,9 @@ def _axes(panel: Panel, points: Float64) -> tuple[Axis, Axis]:
     """Axes that hold nearly all points: a few wild ones are cut off, not given the whole paper."""
     finite = points[np.isfinite(points).all(axis=1)]
     low, high = np.quantile(finite, 0.002, axis=0), np.quantile(finite, 0.998, axis=0)
-    room = np.maximum(high - low, [1e-3, panel.flat])
     middle = (low + high) / 2.0
+    room = np.maximum(high - low, [1e-3, panel.flat])
+    room = np.maximum(room, _LEAST_SHARE * np.abs(middle))
     low, high = middle - 0.54 * room, middle + 0.54 * room
     x = Axis(float(low[0]), float(high[0]), _LEFT, panel.width - _RIGHT)
     y = Axis(float(low[1]), float(high[1]), panel.height - _BOTTOM, _TOP)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from eqrt.runtime.can_check.ego_course import EgoCourse, course_of
-from eqrt.runtime.can_check.ego_findings import ego_findings
-from eqrt.runtime.can_check.message_findings import left_out_findings, message_findings
+from eqrt.runtime.can_check.ego_findings import ego_findings, untold_findings
+from eqrt.runtime.can_check.message_findings import (
+    both_bus_findings,
+    clock_findings,
+    left_out_findings,
+    message_findings,
+    other_bus_findings,
+)
 from eqrt.runtime.can_check.motion import ego_fits, object_fits, share_of_jumps
 from eqrt.runtime.can_check.objects import Objects, classes, gather, object_values, values
 from eqrt.runtime.can_check.observation import Observation
@@ -30,8 +37,13 @@ class Checked:
     course: EgoCourse
 
 
-def check(profile: Profile, seen: Observation, log: str) -> Checked:
-    """Everything that can be said about what was seen."""
+def check(
+    profile: Profile,
+    seen: Observation,
+    log: str,
+    asked: Mapping[str, str | int] | None = None,
+) -> Checked:
+    """Everything that can be said about what was seen, of the channels `asked` for, by bus."""
     course = course_of(seen)
     objects = {sensor.name: _objects(sensor, seen) for sensor in profile.sensors}
     sensors = tuple(
@@ -41,13 +53,13 @@ def check(profile: Profile, seen: Observation, log: str) -> Checked:
     unknown, rest = unknown_messages(profile, seen)
     ego = _ego(seen, course)
     findings: list[Finding] = [*message_findings(rows), *offset_findings(profile, seen)]
+    findings += other_bus_findings(profile, asked, seen) if asked else both_bus_findings(rows)
     findings += left_out_findings(profile, seen.counters)
     for bound, sensor in zip(profile.sensors, sensors, strict=True):
         findings += sensor_findings(sensor, objects[sensor.name], course, bound.mount)
     findings += ego_findings(ego.values, ego.fits, course)
-    if seen.backward_steps:
-        text = f"its clock goes back {seen.backward_steps} times: was it recorded in one piece?"
-        findings.append(Finding(about="log", text=text))
+    findings += untold_findings(profile, asked, seen, course)
+    findings += clock_findings(seen)
     report = Report(
         schema=SCHEMA,
         log=log,

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import write_whole
 from eqrt.runtime.bench.json_form import to_json
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
@@ -56,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
     """Check, and print what was found."""
     log = read_log(args.log)
     profile = load_profile(args.profile)
-    channels = parse_channels(args.can, profile.roles)
-    checked = check(profile, observe(log, profile, channels or None), str(args.log))
+    channels = parse_channels(args.can, profile.roles) or None
+    checked = check(profile, observe(log, profile, channels), str(args.log), channels)
     if log.remark:
         print(f"eqrt: {log.remark}", file=sys.stderr)
     for line in lines(checked.report):
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _write(path: Path, text: str) -> None:
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode())
     except OSError as error:
         raise EqrtError(
             f"cannot write {path} ({error.strerror}); give --json a file that can be written"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from eqrt.core.frames import Pose2
 from eqrt.runtime.can_check.observation import Observation
+from eqrt.runtime.can_check.plain import bounded
 
 Float64 = NDArray[np.float64]
 
@@ -75,7 +76,7 @@ def course_of(seen: Observation) -> EgoCourse:
 def _columns(rows: Sequence[tuple[float, ...]], width: int) -> Float64:
     """(width, n) in the order of time, which comes first."""
     table = np.array(sorted(rows), np.float64).reshape(-1, width)
-    return table.T
+    return bounded(table.T)
 
 
 def _at(time_s: Float64, known_s: Float64, values: Float64) -> Float64:

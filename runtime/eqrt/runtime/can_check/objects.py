@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eqrt.runtime.can_check.plain import bounded
 from eqrt.runtime.can_check.report import Values
 from eqrt.runtime.decoding.detections import Detections, ObjectClass, VelocityKind
 
@@ -81,14 +82,18 @@ def gather(cycles: Sequence[Detections], kind: VelocityKind) -> Objects:
         time_s=time_s,
         object_id=object_id,
         track=np.cumsum(np.concatenate([[False], begins]))[: len(order)],
-        position=_joined([one.position for one in cycles], np.float64, 2)[order],
-        velocity=_joined([one.velocity for one in cycles], np.float64, 2)[order],
-        heading_rad=_joined([one.heading_rad for one in cycles], np.float64)[order],
-        length_m=_joined([one.length_m for one in cycles], np.float64)[order],
-        width_m=_joined([one.width_m for one in cycles], np.float64)[order],
-        existence=_joined([one.existence for one in cycles], np.float64)[order],
+        position=_measured([one.position for one in cycles], 2)[order],
+        velocity=_measured([one.velocity for one in cycles], 2)[order],
+        heading_rad=_measured([one.heading_rad for one in cycles])[order],
+        length_m=_measured([one.length_m for one in cycles])[order],
+        width_m=_measured([one.width_m for one in cycles])[order],
+        existence=_measured([one.existence for one in cycles])[order],
         object_class=_joined([one.object_class for one in cycles], np.uint8)[order],
     )
+
+
+def _measured(arrays: Sequence[Float64], width: int = 0) -> Float64:
+    return bounded(_joined(arrays, np.float64, width))
 
 
 def _joined(arrays: Sequence[NDArray[Any]], dtype: type, width: int = 0) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -17,6 +18,8 @@ from eqrt.runtime.decoding.profile import Profile
 MessageKey = tuple[int, bool]
 """Arbitration id, and whether it is of the 29-bit kind."""
 
+UNNAMED = "-"
+"""The channel of a log that does not say which."""
 _AFTER_THE_END_S = 60.0  # longer than any timeout: what is open then is closed
 
 
@@ -61,12 +64,13 @@ def observe(
     """Decode a log on its own clock, as `eqrt replay` does. `channels`: as of `Decoder`."""
     decoder = Decoder(profile, channels)
     seen = Observation(decoder.counters)
+    before_s = -math.inf
     for message in messages:
         now_s = message.timestamp
         if seen.counters.messages == 0:
             seen.first_s = seen.last_s = now_s
-        seen.backward_steps += now_s < seen.last_s
-        seen.last_s = max(seen.last_s, now_s)
+        seen.backward_steps += now_s < before_s
+        seen.last_s, before_s = max(seen.last_s, now_s), now_s
         _keep(seen, decoder.poll(now_s))
         _note(seen, message, decoder)
     _keep(seen, decoder.poll(seen.last_s + _AFTER_THE_END_S))
@@ -92,7 +96,7 @@ def _note(seen: Observation, message: can.Message, decoder: Decoder) -> None:
 
 def channel_name(message: can.Message) -> str:
     """What the recorder called the bus; a dash if it does not say."""
-    return "-" if message.channel is None else str(message.channel)
+    return UNNAMED if message.channel is None else str(message.channel)
 
 
 def _keep(seen: Observation, events: list[Event]) -> None:

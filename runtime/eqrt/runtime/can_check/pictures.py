@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import write_whole
 from eqrt.core.frames import Pose2
 from eqrt.runtime.can_check.chart import Marks, Panel, figure
 from eqrt.runtime.can_check.check import Checked
@@ -24,6 +26,7 @@ Float64 = NDArray[np.float64]
 MOST_DRAWN = 12_000
 """Measurements in one picture; of a longer log every n-th cycle is drawn."""
 _STILL_MPS = 1.0
+_NO_PART_OF_A_NAME = re.compile(r"[\0/\\]")  # a sensor may be called front/left
 _TRACK_COLORS = ("blue", "orange", "green", "grey")
 
 
@@ -33,8 +36,8 @@ def write_pictures(folder: Path, profile: Profile, checked: Checked) -> list[Pat
         folder.mkdir(parents=True, exist_ok=True)
         written = []
         for name, text in _pictures(profile, checked):
-            path = folder / f"{name}.svg"
-            path.write_text(text, encoding="utf-8")
+            path = folder / f"{_NO_PART_OF_A_NAME.sub('-', name)}.svg"
+            write_whole(path, text.encode())
             written.append(path)
     except OSError as error:
         raise EqrtError(

@@ -8,6 +8,7 @@ from eqrt.core.frames import Pose2
 from eqrt.runtime.can_check.ego_course import EgoCourse
 from eqrt.runtime.can_check.motion_findings import motion_texts
 from eqrt.runtime.can_check.objects import Objects
+from eqrt.runtime.can_check.plain import plain
 from eqrt.runtime.can_check.report import Finding, Sensor, Values
 
 _MAX_SPEED_MPS, _MAX_RANGE_M = 90.0, 400.0
@@ -48,13 +49,16 @@ def _speed_texts(rows: dict[str, Values]) -> Iterator[str]:
         if row is None or row.p5 is None or row.p95 is None:
             continue
         if max(abs(row.p5), abs(row.p95)) > _MAX_SPEED_MPS:
-            yield f"{name} goes from {row.low:.0f} to {row.high:.0f} m/s: unit, sign or byte order"
+            span = f"{plain(row.low)} to {plain(row.high)}"
+            yield f"{name} goes from {span} m/s: unit, sign or byte order"
 
 
 def _range_texts(rows: dict[str, Values]) -> Iterator[str]:
     row = rows["range"]
     if row.median is not None and (row.p95 or 0.0) > _MAX_RANGE_M:
-        yield f"5 % of the objects are more than {row.p95:.0f} m away: unit or byte order of x, y"
+        yield (
+            f"5 % of the objects are more than {plain(row.p95)} m away: unit or byte order of x, y"
+        )
     if row.median is not None and row.count >= _FEW and (row.p95 or 0.0) < 2.0:
         yield f"95 % of the objects are nearer than {row.p95:.2f} m: is the unit right?"
 

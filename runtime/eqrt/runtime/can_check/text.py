@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from eqrt.runtime.can_check.plain import plain
 from eqrt.runtime.can_check.report import Fit, Report, Rhythm, Sensor, Values
 from eqrt.runtime.can_check.scale import tells
 
@@ -125,7 +126,7 @@ def _values(values: Iterable[Values]) -> Iterator[str]:
     rows = [
         (
             f"{row.name}, {row.unit}" if row.unit else row.name,
-            *(_number(x) for x in (row.low, row.p5, row.median, row.p95, row.high)),
+            *(plain(x, 2) for x in (row.low, row.p5, row.median, row.p95, row.high)),
             f"{row.missing:.0%}" if row.missing else "",
         )
         for row in values
@@ -145,20 +146,16 @@ def _fits(fits: Sequence[Fit]) -> Iterator[str]:
         (
             fit.what,
             str(fit.pairs),
-            f"{fit.spread:.2f}",
-            _number(fit.correlation),
-            _number(fit.slope),
-            _number(fit.residual),
+            plain(fit.spread, 2),
+            plain(fit.correlation, 2),
+            plain(fit.slope, 2),
+            plain(fit.residual, 2),
             "" if tells(fit) else "too little movement to tell",
         )
         for fit in fits
     ]
     heads = ("", "pairs", "spread", "correlation", "slope", "off by", "")
     yield from _table(heads, rows, left=1)
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _verdict(report: Report) -> Iterator[str]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.runtime.can_check.observation import MessageKey, Observation, Stream
+from eqrt.runtime.can_check.observation import UNNAMED, MessageKey, Observation, Stream
 from eqrt.runtime.can_check.report import Channel, ProfileMessage, Rhythm, UnknownMessage
 from eqrt.runtime.decoding.addresses import Address
 from eqrt.runtime.decoding.profile import Profile
@@ -22,6 +22,8 @@ class Named:
     """A message of the profile, and who reads it."""
 
     address: Address
+    bus: str
+    """The role of the bus that it is on."""
     user: str
     optional: bool
 
@@ -30,18 +32,26 @@ def named_messages(profile: Profile) -> Iterator[Named]:
     """Every message of the profile, in its order; one that several read comes several times."""
     for sensor in profile.sensors:
         if sensor.header is not None:
-            yield Named(sensor.header.address, sensor.name, optional=False)
+            yield Named(sensor.header.address, sensor.bus, sensor.name, optional=False)
         for part in sensor.parts:
             for address in part.addresses:
-                yield Named(address, sensor.name, part.optional)
+                yield Named(address, sensor.bus, sensor.name, part.optional)
     for ego in profile.ego:
         for ego_part in ego.parts:
-            yield Named(ego_part.address, "ego", optional=False)
+            yield Named(ego_part.address, ego.bus, "ego", optional=False)
 
 
 def key_of(address: Address) -> MessageKey:
     """As in `Observation.streams`."""
     return address.arbitration_id, address.is_extended
+
+
+def has_come(address: Address, channel: str | int | None, seen: Observation) -> bool:
+    """Whether the message came, mostly whole, on that channel; None = on any."""
+    stream = seen.streams.get(key_of(address), Stream())
+    names = stream.channels.keys() if channel is None else {str(channel), UNNAMED}
+    damaged = stream.short + stream.bad_checksum + stream.bad_counter
+    return bool(names & stream.channels.keys()) and 2 * damaged < len(stream.times_s)
 
 
 def profile_messages(profile: Profile, seen: Observation) -> tuple[ProfileMessage, ...]:

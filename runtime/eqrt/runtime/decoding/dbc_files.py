@@ -61,7 +61,7 @@ def parse_dbc(content: bytes, path: Path) -> Dbc:
     # Imported here because it costs 50 ms and 3 MB, which a command without a profile is spared.
     from cantools.database.can.formats import dbc  # noqa: PLC0415
 
-    layout = layout_of(content.decode("cp1252", "replace"), f"the DBC {path}")  # its encoding
+    layout = layout_of(_text(content), f"the DBC {path}")
     try:
         messages = [_message(message) for message in _parsed(dbc.load_string, layout, path)]
     except (KeyError, RecursionError) as error:
@@ -69,6 +69,13 @@ def parse_dbc(content: bytes, path: Path) -> Dbc:
             f"the DBC {path} has a multiplexer that is missing, or stands in its own way"
         ) from error
     return Dbc(path, {message.name: message for message in messages})
+
+
+def _text(content: bytes) -> str:
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:  # as nearly any text in the format's own encoding that is no ASCII
+        return content.decode("cp1252", "replace")
 
 
 def _parsed(parse: Callable[..., Any], layout: str, path: Path) -> list[Any]:

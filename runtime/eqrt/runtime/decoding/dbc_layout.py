@@ -34,6 +34,9 @@ _KEYWORDS = _UNENDED.union(
     | {"EV_DATA_", "FILTER", "SGTYPE_", "SGTYPE_VAL_", "SG_MUL_VAL_", "SIGTYPE_VALTYPE_"}
     | {"SIG_GROUP_", "SIG_TYPE_REF_", "SIG_VALTYPE_", "VAL_", "VAL_TABLE_"}
 )
+_ID_AT = {"BO_": 1, "SIG_VALTYPE_": 1, "SG_MUL_VAL_": 1, "BA_": 3}
+"""Which token of a statement is a message's id."""
+_MAX_STANDARD_ID, _MAX_EXTENDED_ID, _IS_EXTENDED = 0x7FF, 0x1FFFFFFF, 1 << 31
 _BLANKED = re.compile(r"[^\n]")
 _LAYOUT = frozenset({"BO_", "SG_", "SIG_VALTYPE_", "SG_MUL_VAL_"})
 _LONG_NAMES = frozenset({'"SystemMessageLongSymbol"', '"SystemSignalLongSymbol"'})
@@ -58,7 +61,7 @@ def layout_of(text: str, where: str) -> str:
             _check_sizes(tokens, where)
         elif tokens[0] != "BA_" or not _LONG_NAMES.intersection(tokens[1:2]):
             piece = _BLANKED.sub(" ", piece)
-        pieces.append(piece)
+        pieces.append(_with_whole_id(piece, tokens))
     layout = "".join(pieces)
     if "BO_" not in layout:
         raise ProfileError(f"{where} describes no message; is it a DBC?")
@@ -82,6 +85,17 @@ def _statements(text: str) -> Iterator[tuple[int, int, list[str]]]:
             tokens.append(token)
             is_open = is_open and token != ";"
     yield start, len(text), tokens
+
+
+def _with_whole_id(piece: str, tokens: list[str]) -> str:
+    """The statement; an id above 0x7FF with the bit that says that it has 29, if it lacks that.
+
+    DBCs of opendbc lack it, and cantools takes no such message, and so nothing of the file.
+    """
+    number = "".join(tokens[_ID_AT.get(tokens[0], 0) :][:1])
+    if not _MAX_STANDARD_ID < _whole(number) <= _MAX_EXTENDED_ID:
+        return piece
+    return re.sub(rf"\b{number}\b", str(_whole(number) | _IS_EXTENDED), piece, count=1)
 
 
 def _check_sizes(tokens: list[str], where: str) -> None:

@@ -55,7 +55,8 @@ class EgoDecoder:
         events: list[EgoMotion | EgoPose] = []
         if self._profile.valid is not None and not self._profile.valid.holds(self._values):
             return events
-        timestamp_s = arrived_s - self._profile.latency_s - (self._number("age") or 0.0)
+        age_s = max(0.0, self._number("age") or 0.0)  # nothing is measured after it came
+        timestamp_s = arrived_s - self._profile.latency_s - age_s
         speed, yaw_rate = self._number("speed"), self._number("yaw_rate")
         if speed is not None and self._profile.reverse is not None:
             speed = -speed if self._profile.reverse.holds(self._values) else speed

@@ -7,12 +7,13 @@ sensor by name: what is loaded here is all it goes by.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from eqrt.core.errors import ProfileError
+from eqrt.core.files import may_be_file
 from eqrt.runtime.decoding import dbc_files, toml_tables
 from eqrt.runtime.decoding.dbc_files import Dbc, load_dbc, parse_dbc
 from eqrt.runtime.decoding.ego_profile import EgoProfile, bind_ego
@@ -56,8 +57,12 @@ class Profile:
     @property
     def ids(self) -> frozenset[tuple[int, bool]]:
         """The same, and whether each is an extended one."""
-        addresses = [part.address for ego in self.ego for part in ego.parts]
-        for sensor in self.sensors:
+        return self.ids_on(self.roles)
+
+    def ids_on(self, buses: Collection[str]) -> frozenset[tuple[int, bool]]:
+        """Those of some of its buses, by their roles."""
+        addresses = [part.address for ego in self.ego if ego.bus in buses for part in ego.parts]
+        for sensor in (sensor for sensor in self.sensors if sensor.bus in buses):
             addresses += [address for part in sensor.parts for address in part.addresses]
             addresses += [sensor.header.address] if sensor.header else []
         return frozenset((address.arbitration_id, address.is_extended) for address in addresses)
@@ -170,7 +175,7 @@ def _path(name_or_path: str) -> Path:
     path = Path(name_or_path)
     if path.suffix != ".toml" and path.name == name_or_path:
         path = _PROFILES / f"{name_or_path}.toml"
-    if path.is_file():
+    if may_be_file(path):
         return path
     known = ", ".join(builtin_profiles())
     raise ProfileError(
@@ -181,7 +186,7 @@ def _path(name_or_path: str) -> Path:
 def _dbc_path(name: str, profile: Path) -> Path:
     """The DBC that a profile names: beside the profile, or one of ours."""
     for path in (profile.parent / name, _DBCS / name):
-        if path.is_file():
+        if may_be_file(path):
             return path
     known = ", ".join(sorted(str(path.relative_to(_DBCS)) for path in _DBCS.rglob("*.dbc")))
     raise ProfileError(

@@ -42,7 +42,7 @@ def parse_toml(content: bytes, kind: type[T], path: str) -> T:
     Raises ProfileError if it is not TOML, or has a wrong key or type.
     """
     try:
-        values = tomllib.loads(content.decode("utf-8"))
+        values = tomllib.loads(content.decode("utf-8-sig"))  # some editors begin with a mark
     except (ValueError, RecursionError) as error:  # neither UTF-8 nor TOML, or far too deep
         raise ProfileError(f"{path} is not TOML: {error}") from error
     return cast("T", _table(values, kind, path, ""))

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -58,9 +58,12 @@ def check_channel(
     profile: Profile | None,
     seconds: float,
     *,
+    buses: Collection[str],
     sends: bool,
 ) -> Iterator[Finding]:
-    """Open it, and listen for so long, 0 = not at all; `sends`: predictions go there."""
+    """Open it, and listen for so long, 0 = not at all; `buses`: those of the profile that are said
+    to be on it; `sends`: predictions go there.
+    """
     name = f"channel {channel}"
     try:
         with open_bus(channel, interface, fd=fd) as bus:
@@ -76,7 +79,7 @@ def check_channel(
         return
     yield judge_load(f"traffic {channel}", traffic, link.get("bitrate"))
     if profile is not None:
-        yield _known(f"ids {channel}", traffic, profile)
+        yield judge_ids(f"ids {channel}", traffic, profile, buses)
 
 
 def heard(bus: can.BusABC, seconds: float) -> Traffic:
@@ -178,11 +181,17 @@ def judge_load(name: str, traffic: Traffic, bitrate: int | None) -> Finding:
     return ok(name, found)
 
 
-def _known(name: str, traffic: Traffic, profile: Profile) -> Finding:
-    known = set(profile.arbitration_ids)
+def judge_ids(name: str, traffic: Traffic, profile: Profile, buses: Collection[str]) -> Finding:
+    """Whether messages came that the profile reads on these of its buses."""
+    known = {number for number, _ in profile.ids_on(buses)}
     came = sorted(known & set(traffic.ids))
     missing = sorted(known - set(traffic.ids))
-    found = f"{len(came)} of the profile's {len(known)} heard"
+    others = [role for role in profile.roles if role not in buses]
+    where = f" for {' and '.join(buses)}" if others else ""
+    found = f"{len(came)} of the profile's {len(known)}{where} heard"
+    if not came and traffic.ids.keys() & {number for number, _ in profile.ids_on(others)}:
+        found += f", but of those for {' and '.join(others)}"
+        return warn(name, found, "which channel is which? see --can")
     if not came:
         return warn(name, found, f"{profile.name} is not for what is on this channel")
     if missing:

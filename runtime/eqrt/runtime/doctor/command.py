@@ -105,13 +105,16 @@ def _channels(
     asked: argparse.Namespace, profile: Profile | None, listen_s: float
 ) -> Iterator[Finding]:
     heard = {option.rpartition("=")[2] for option in asked.can or ()}
+    roles = () if profile is None else profile.roles
+    channels: dict[str, str] = {}
     if not heard:
         yield warn("channels", "none named", "name one with --can or in --config")
     elif profile is not None:
         try:
-            heard = set(parse_channels(asked.can, profile.roles).values())
+            channels = parse_channels(asked.can, roles)
         except EqrtError as error:
             yield fail("channels", str(error))
+        heard = set(channels.values()) or heard
     out = out_channel(asked)
     for channel in sorted(heard if out is None else heard | {out}):
         yield from check_channel(
@@ -120,6 +123,7 @@ def _channels(
             asked.fd,
             profile,
             listen_s if channel in heard else 0.0,
+            buses=[role for role in roles if channels.get(role, channel) == channel],
             sends=channel == out,
         )
 

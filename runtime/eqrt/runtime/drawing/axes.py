@@ -55,4 +55,4 @@ def round_ticks(low: float, high: float) -> list[float]:
 
 def shown(value: float) -> str:
     """A tick's label."""
-    return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+    return f"{value:,.0f}" if 1e3 <= abs(value) < 1e9 else f"{value:.3g}"
