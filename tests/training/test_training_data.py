@@ -58,20 +58,21 @@ def test_weights_tell_targets_driving_and_standing_windows_apart(scenes: Path) -
     assert pool.samples_per_epoch == round(pool.weights.sum())
 
 
-def test_windows_that_are_not_whole_are_drawn_less_often(scenes: Path) -> None:
+def test_windows_that_their_recording_cuts_off_are_drawn_less_often(scenes: Path) -> None:
+    """Scenes last 50 steps, 0 to 49; a target that is lost before their end is no edge."""
     everything = DataConfig(stride=6, held_out=("1",), focal_weight=3.0, standing_weight=0.5)
     as_they_are = opened(scenes, everything).pool
-    pool = opened(scenes, replace(everything, partial_share=0.2)).pool
-    windows = pool.gather(np.arange(len(pool)))
-    whole = windows.future_valid.all(axis=1) & (windows.history_valid[:, 0].sum(axis=1) > 10)
-    assert 0 < whole.sum() < len(whole)
-    assert np.allclose(pool.weights, as_they_are.weights * np.where(whole, 1.0, 0.2))
+    pool = opened(scenes, replace(everything, cut_share=0.2)).pool
+    step = pool.gather(np.arange(len(pool))).step
+    inside = (step + 30 <= 49) & (step + 1 > 10)
+    assert set(step[inside]) == {13, 19}
+    assert np.allclose(pool.weights, as_they_are.weights * np.where(inside, 1.0, 0.2))
 
 
 def test_a_share_of_nothing_is_refused() -> None:
-    """Windows that are never drawn need not be read at all: `targets` chooses."""
-    with pytest.raises(ValueError, match="partial_share"):
-        fill(DataConfig, {"partial_share": 0.0}, "data")
+    """Windows that are never drawn need not be read at all: `targets` and `stride` choose."""
+    with pytest.raises(ValueError, match="cut_share"):
+        fill(DataConfig, {"cut_share": 0.0}, "data")
 
 
 def test_a_share_of_the_recordings_is_trained_on_and_all_that_are_held_out_measure(

@@ -45,10 +45,10 @@ class DataConfig:
     """Likewise one of another target that moves MIN_DRIVE_M or more while it is seen."""
     standing_weight: NotNegative = 1.0
     """Likewise all the rest. Most of recorded traffic is parked, and easy."""
-    partial_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
-    """Of these, so much for a window whose target is not seen to the end of the horizon, or for no
-    more than half of its history. Models are measured on whole windows, and their last steps, the
-    hardest, are learned from windows that have them."""
+    cut_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
+    """Of these, so much for a window that its recording cuts off: that ends before the horizon
+    does, or had begun no more than half a history before. Models are measured on whole windows,
+    and the end of the horizon, the hardest part, is learned from windows that reach it."""
 
     def window_options(self) -> WindowOptions | None:
         """For the cutter; None = nothing is asked for."""

@@ -128,24 +128,38 @@ def _why_none(config: DataConfig) -> str:
 def _weights(config: DataConfig, store: WindowStore, rows: Rows) -> NDArray[np.float64]:
     """How often each of the rows is drawn in an epoch."""
     focal, standing = store.column("focal")[rows], config.standing_weight
-    if config.driving_weight == standing and config.partial_share == 1.0:
+    if config.driving_weight == standing and config.cut_share == 1.0:
         return np.where(focal, config.focal_weight, standing)  # the windows need not be read
-    drives, whole = _looked_at(store, rows)
-    weights = np.select(
-        [focal, drives], [config.focal_weight, config.driving_weight], config.standing_weight
-    )
-    return weights * np.where(whole, 1.0, config.partial_share)
+    drives, cut = _looked_at(store, rows)
+    weights = np.select([focal, drives], [config.focal_weight, config.driving_weight], standing)
+    return weights * np.where(cut, config.cut_share, 1.0)
 
 
 def _looked_at(store: WindowStore, rows: Rows) -> tuple[Bool, Bool]:
-    """Of each window: whether its target moves while it is seen, and whether it is whole."""
-    chunks = range(0, len(rows), _CHUNK)
-    parts = [
-        (_drive(windows), _is_whole(windows))
-        for windows in (store.gather(rows[first : first + _CHUNK]) for first in chunks)
-    ]
-    drives, whole = (np.concatenate(kind) for kind in zip(*parts, strict=True))
-    return drives, whole
+    """Of each window: whether its target moves while it is seen, and whether it is cut off."""
+    chunks = [rows[first : first + _CHUNK] for first in range(0, len(rows), _CHUNK)]
+    looked = [(_drive(windows), _seen_ahead(windows)) for windows in map(store.gather, chunks)]
+    drives, ahead = (np.concatenate(kind) for kind in zip(*looked, strict=True))
+    return drives, _is_cut(store, rows, ahead)
+
+
+def _is_cut(store: WindowStore, rows: Rows, ahead: Rows) -> Bool:
+    """Whether the recording ends within the horizon, or began within half a history.
+
+    It ends with the last step that any of its targets is seen at.
+    """
+    recording, step = store.column("recording")[rows], store.column("step")[rows]
+    last = np.zeros(len(store.recordings), np.intp)
+    np.maximum.at(last, recording, step + ahead)
+    contract = store.contract
+    cut: Bool = step + contract.horizon_steps > last[recording]
+    return cut | (2 * (step + 1) <= contract.history_steps)
+
+
+def _seen_ahead(windows: Windows) -> Rows:
+    """How many steps ahead each target is seen last."""
+    seen = windows.future_valid
+    return np.where(seen.any(axis=1), seen.shape[1] - seen[:, ::-1].argmax(axis=1), 0)
 
 
 def _drive(windows: Windows) -> Bool:
@@ -156,11 +170,3 @@ def _drive(windows: Windows) -> Bool:
     moved = path[row, last - seen[:, ::-1].argmax(axis=1)] - path[row, seen.argmax(axis=1)]
     drives: Bool = np.hypot(*moved.T) >= MIN_DRIVE_M
     return drives
-
-
-def _is_whole(windows: Windows) -> Bool:
-    """Whether the target is seen at every step of the horizon, and at most of its history."""
-    history = windows.history_valid[:, 0]
-    mostly = 2 * history.sum(axis=1) > history.shape[1]
-    whole: Bool = mostly & windows.future_valid.all(axis=1)
-    return whole
