@@ -1,0 +1,1 @@
+BprobabilitiesJff>4L>°÷G>]‘!>šæ=k…á=

@@ -1,0 +1,1 @@
+BprobabilitiesJ‘†>ûv>ºWo>õQ<>}z=O"<

@@ -1,0 +1,1 @@
+BprobabilitiesJžê†>¨‚~>Ør>øP:>u=kä <

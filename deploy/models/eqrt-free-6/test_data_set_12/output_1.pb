@@ -1,0 +1,1 @@
+BprobabilitiesJ£ê†>¡‚~>èr>ïP:>øu=Yä <

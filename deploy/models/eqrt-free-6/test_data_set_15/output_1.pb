@@ -1,0 +1,1 @@
+BprobabilitiesJLÀn>äl`>u1?>·)>ùÏø=——=

@@ -1,0 +1,1 @@
+BprobabilitiesJE±q>0Ÿn>¹±=>É·*>ÝKÖ=@@˜=

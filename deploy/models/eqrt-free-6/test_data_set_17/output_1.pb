@@ -1,0 +1,1 @@
+BprobabilitiesJªCT>Ž3Q>÷B>š+>iæ>†ÿ°=

@@ -1,0 +1,1 @@
+BprobabilitiesJsff>ÆL>×öG>’!>Þšæ=û‚á=

@@ -1,0 +1,1 @@
+BprobabilitiesJ}∆e>ºÄb>•\C>`Q$>Ú!>ú—ï=

@@ -1,0 +1,1 @@
+BprobabilitiesJÄSg> a>}B>@ÿ#>ùkø=}²¨=

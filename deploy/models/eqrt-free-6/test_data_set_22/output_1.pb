@@ -1,0 +1,1 @@
+BprobabilitiesJû–>1ët>sC>âe>šzÇ=qˆŽ=

@@ -1,0 +1,1 @@
+BprobabilitiesJ-ff>«L>÷G>Ì‘!>çšæ=¯ƒá=

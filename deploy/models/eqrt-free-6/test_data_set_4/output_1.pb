@@ -1,0 +1,1 @@
+BprobabilitiesJb‹>*yB>oÍA>~F>2æ=j+·=

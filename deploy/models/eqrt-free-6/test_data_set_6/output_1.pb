@@ -1,0 +1,1 @@
+BprobabilitiesJpÑ>nSq>D0/>l¿(>‚¢Ñ=V4œ=

@@ -1,0 +1,1 @@
+BprobabilitiesJ‚Ñ>Sq>Y0/>x¿(>Y¢Ñ=á3œ=

@@ -1,0 +1,1 @@
+BprobabilitiesJP^o>ª$M>ãJ>Â»!>šÎç=*†Ç=

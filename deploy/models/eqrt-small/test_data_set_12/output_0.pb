@@ -1,0 +1,1 @@
+BtrajectoriesJðUÙ×Ã¹KTCIÙ×ÃÄKTCjÙ×ÃƒLTC¬Ù×Ã¥MTCÚ×ÃñNTCoÚ×Ã=PTCàÚ×ÃrQTCTÛ×ÃRTCÆÛ×ÃeSTC1Ü×ÃTTC“Ü×Ã³TTCéÜ×Ã(UTC2Ý×Ã…UTClÝ×ÃÎUTC˜Ý×ÃVTC¶Ý×Ã2VTCÅÝ×ÃLVTCÅÝ×ÃOVTC¸Ý×Ã5VTCÝ×ÃóUTCuÝ×Ã€UTC@Ý×ÃÑTTCüÜ×ÃßSTC©Ü×Ã§RTCDÜ×Ã*QTCËÛ×ÃuOTC;Û×Ã MTCÚ×ÃÓKTC½Ù×ÃHJTCÂØ×ÃPITC

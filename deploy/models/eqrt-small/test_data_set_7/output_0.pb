@@ -1,0 +1,2 @@
+BtrajectoriesJð]ØÃ	ÐTC,ØÃRUCaYØÃ*ÑUC‰ØÃ!LVCñºØÃ4ÂVCõîØÃø2WC%ÙÃIžWCG]ÙÃ7XC—ÙÃødXCÔÙÃÕÀXCÏÚÃ%YC¾SÚÃ?kYCì–ÚÃrºYCXÜÚÃZCü#ÛÃNZCÊmÛÃç’ZC­¹ÛÃeÔZCˆÜÃ’[C:WÜÃZM[Cš¨ÜÃž„[C}ûÜÃB¸[CµOÝÃ1è[C¥ÝÃj\CnûÝÃ=\CœRÞÃyb\C€ªÞÃ9…\C
+ßÃ>¦\C8\ßÃâÆ\C¶ßÃÿè\CëàÃ]C
