@@ -22,6 +22,7 @@ from typing import BinaryIO
 import can
 
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.files import whole
 from eqrt.runtime.advice import no_predictions
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
@@ -306,18 +307,10 @@ def output(name: str) -> Iterator[BinaryIO]:
         yield sys.stdout.buffer
         return
     path = Path(name)
-    in_place = path.exists() and not path.is_file()  # a device or a pipe
-    written = path if in_place else path.parent / f"{path.name}.part"
     try:
-        with written.open("wb") as stream:
+        with whole(path) as stream:
             yield stream
-        if not in_place:
-            os.replace(written, path)
     except OSError as error:
         raise EqrtError(
             f"cannot write {path} ({error.strerror}); give --out a file that can be written"
         ) from error
-    finally:
-        if not in_place:
-            with contextlib.suppress(OSError):
-                written.unlink(missing_ok=True)
