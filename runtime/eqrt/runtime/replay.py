@@ -31,6 +31,7 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.recording.folder import recordings_in
 from eqrt.runtime.recording.reader import is_recording, read_recordings
 from eqrt.runtime.recording.replaying import Instead, LeftOut, Replay
 from eqrt.runtime.run_diff import compare_runs, table
@@ -92,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("where should the predictions go? give --out FILE, or --diff RUN")
     replayed = _replay_of(args, args.model)
     out_name = args.out if args.out is not None else os.devnull
+    _check_not_read(out_name, args)
     compares = args.diff is not None or args.diff_model is not None
     modes: Counter[Mode] = Counter()
     started_s = time.perf_counter()
@@ -103,6 +105,17 @@ def run(args: argparse.Namespace) -> int:
             raise EqrtError(f"no predictions: {no_predictions(replayed.pipelines[-1])}")
     _say(replayed, modes, time.perf_counter() - started_s)
     return PARTLY if status == 0 and replayed.left_out else status
+
+
+def _check_not_read(out_name: str, args: argparse.Namespace) -> None:
+    """UsageError if the predictions would take the place of what they are made of."""
+    out = Path(out_name)
+    if out_name == "-" or not out.is_file():
+        return
+    given = [Path(one) for one in (args.log, args.profile, args.tile, args.diff) if one is not None]
+    files = [file for one in given for file in (recordings_in(one) if one.is_dir() else [one])]
+    if any(file.is_file() and file.samefile(out) for file in files):
+        raise UsageError(f"--out {out} is read here and would be lost; choose another file")
 
 
 def _exhaust(lines: Iterator[bytes]) -> int:
