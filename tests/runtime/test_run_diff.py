@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -105,6 +106,16 @@ def test_other_time_steps_are_not_compared() -> None:
 def test_a_line_that_is_no_prediction_is_an_error() -> None:
     with pytest.raises(LogError, match="the second run: line 1 is no prediction"):
         diff(run(), b'{"cycle": 1}\n')
+
+
+@pytest.mark.parametrize("trajectories", [b"[]", b'"far"', b"[[[1.0]]]"])
+def test_a_line_without_trajectories_is_an_error(trajectories: bytes) -> None:
+    line, *more = run().splitlines()
+    broken = re.sub(rb'"trajectories":.*', b'"trajectories":' + trajectories + b"}", line)
+    with pytest.raises(
+        LogError, match=r"object \d+ in the cycle at 0.000000 s has no trajectories"
+    ):
+        diff(run(), b"\n".join([broken, *more]))
 
 
 # --- the command
