@@ -37,7 +37,7 @@ from handmade_model import (
     with_initializer,
     write_handmade,
 )
-from processes import environment
+from processes import environment, files_of_at_most
 from source_tree import ROOT
 
 RESEARCH = ROOT / "deploy/models/eqrt-small-6"
@@ -384,6 +384,17 @@ def test_the_status_is_1_if_anything_failed(
     assert run(str(handmade), "--json", str(tmp_path / "report.json")) == 1
     assert "NOT VERIFIED: 1 of 16 checks failed" in capsys.readouterr().out
     assert json.loads((tmp_path / "report.json").read_text())["verified"] is False
+
+
+def test_findings_that_do_not_fit_on_the_disk_are_printed_and_the_old_file_stays(
+    handmade: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "report.json"
+    report.write_text("yesterday's")
+    with files_of_at_most(1 << 10), pytest.raises(EqrtError, match="File too large"):
+        run(str(handmade), "--json", str(report))
+    assert "verified: all 16 checks passed" in capsys.readouterr().out
+    assert report.read_text() == "yesterday's"
 
 
 def test_what_is_no_folder_is_refused_in_one_line(tmp_path: Path) -> None:
