@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eqrt.core.errors import EqrtError
+from eqrt.core.errors import EqrtError, UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.prediction.model_file import parse_model_file
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Prediction
@@ -400,6 +400,11 @@ def test_findings_that_do_not_fit_on_the_disk_are_printed_and_the_old_file_stays
 def test_what_is_no_folder_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EqrtError, match="no such folder; an artifact is one"):
         run(str(tmp_path / "nothing"))
+
+
+def test_a_seed_below_zero_is_refused() -> None:
+    with pytest.raises(UsageError, match="--seed is -1; give 0 or more"):
+        run("--seed", "-1")
 
 
 def test_a_model_file_is_read_without_the_onnx_package(handmade: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eqrt.core.errors import ContractError, EqrtError
+from eqrt.core.errors import ContractError, EqrtError, UsageError
 from eqrt.core.files import write_whole
 from eqrt.runtime.prediction.model_file import read_model_file
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
@@ -67,6 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the findings; 0 if everything is as promised, else 1."""
+    if args.seed < 0:
+        raise UsageError(f"--seed is {args.seed}; give 0 or more")
     if not args.artifact.is_dir():
         raise ContractError(f"{args.artifact}: no such folder; an artifact is one")
     report = verify(args.artifact, args.seed)
