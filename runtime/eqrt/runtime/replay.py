@@ -34,7 +34,7 @@ from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.recording.folder import recordings_in
 from eqrt.runtime.recording.reader import is_recording, read_recordings
 from eqrt.runtime.recording.replaying import Instead, LeftOut, Replay
-from eqrt.runtime.run_diff import compare_runs, table
+from eqrt.runtime.run_diff import Difference, compare_runs, table
 from eqrt.runtime.serve import load_pipeline
 from eqrt.runtime.serve_options import add_pipeline_arguments
 
@@ -99,10 +99,11 @@ def run(args: argparse.Namespace) -> int:
     started_s = time.perf_counter()
     with output(out_name) as out:
         lines = _written(replayed, out, modes)
-        status = _compare(args, lines, replayed) if compares else _exhaust(lines)
+        compared = _compare(args, lines, replayed) if compares else _exhaust(lines)
         if not (compares or replayed.left_out or _predictions(replayed)):
             _say(replayed, modes, time.perf_counter() - started_s)
             raise EqrtError(f"no predictions: {no_predictions(replayed.pipelines[-1])}")
+    status = 0 if compared is None else _tell(args, *compared)
     _say(replayed, modes, time.perf_counter() - started_s)
     return PARTLY if status == 0 and replayed.left_out else status
 
@@ -118,10 +119,11 @@ def _check_not_read(out_name: str, args: argparse.Namespace) -> None:
         raise UsageError(f"--out {out} is read here and would be lost; choose another file")
 
 
-def _exhaust(lines: Iterator[bytes]) -> int:
+def _exhaust(lines: Iterator[bytes]) -> tuple[Difference, str] | None:
+    """There is nothing to compare with."""
     for _ in lines:
         pass
-    return 0
+    return None
 
 
 def _predictions(replayed: _LogReplay | _RecordingReplay) -> int:
@@ -159,14 +161,19 @@ def _written(
 
 def _compare(
     args: argparse.Namespace, lines: Iterator[bytes], replayed: _LogReplay | _RecordingReplay
-) -> int:
+) -> tuple[Difference, str]:
+    """How the replay differs from another run, and what that is called."""
     if args.diff is not None:
         other, name = _lines_of(args.diff), args.diff.name
     else:
         forecasts = _replay_of(args, args.diff_model, everywhere=True)
         other = (line for forecast in forecasts for line in json_lines(forecast).splitlines())
         name = args.diff_model.name
-    found = compare_runs(lines, other, replayed.is_left_out)
+    return compare_runs(lines, other, replayed.is_left_out), name
+
+
+def _tell(args: argparse.Namespace, found: Difference, name: str) -> int:
+    """Print the difference; returns the exit status."""
     text = table(found, "the replay", name)
     print(text, end="", file=sys.stderr if args.out == "-" else sys.stdout)
     if found.is_none:
