@@ -150,12 +150,13 @@ def test_wrong_usage_is_refused_in_one_line_before_anything_is_measured(
     ],
 )
 def test_a_report_that_cannot_be_written_is_known_before_anything_is_measured(
-    arguments: list[str], said: str
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The command line is right; the folder is not, and that can be mended: status 1."""
     with pytest.raises(EqrtError, match=said) as error:
         bench(*arguments)
     assert error.value.exit_code == 1
+    assert capsys.readouterr().out == ""
 
 
 def test_two_reports_do_not_go_into_one_file(tmp_path: Path) -> None:
