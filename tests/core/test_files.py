@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import errno
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from eqrt.core.files import may_be_file, read_at_most, write_whole
-from processes import files_of_at_most
+from processes import environment, files_of_at_most
+
+LINKS = pytest.mark.skipif(sys.platform != "linux", reason="of links as Linux has them")
 
 
 def test_a_file_of_just_the_size_is_read(tmp_path: Path) -> None:
@@ -55,3 +58,30 @@ def test_a_file_is_written_whole_or_stays_what_it_was(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
         write_whole(tmp_path, b"")
     assert [one.name for one in tmp_path.iterdir()] == ["found.json"]
+
+
+@LINKS
+def test_a_link_stays_and_leads_to_what_is_written(tmp_path: Path) -> None:
+    (tmp_path / "linked").symlink_to("found.json")
+    for content in (b"first", b"second"):  # where it leads to nothing yet, too
+        write_whole(tmp_path / "linked", content)
+        assert (tmp_path / "linked").is_symlink()
+        assert (tmp_path / "found.json").read_bytes() == content
+
+
+@LINKS
+def test_the_link_to_our_own_output_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    """As /dev/stdout is one, which whoever may write in /dev would lose to all other programs."""
+    link, taken = tmp_path / "stdout", tmp_path / "taken"
+    link.symlink_to("/proc/self/fd/1")
+    say = (
+        "import sys; from pathlib import Path; from eqrt.core.files import write_whole; "
+        "print('before', flush=True); write_whole(Path(sys.argv[1]), b'whole\\n'); print('after')"
+    )
+    with taken.open("wb") as stream:
+        subprocess.run(
+            [sys.executable, "-c", say, str(link)], stdout=stream, check=True, env=environment()
+        )
+    assert link.is_symlink()
+    assert taken.read_bytes() == b"before\nwhole\nafter\n"
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["stdout", "taken"]

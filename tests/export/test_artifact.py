@@ -28,6 +28,7 @@ from eqrt.training.networks.compact import CompactConfig, CompactPredictor
 from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.registry import ModelConfig
 from poses import random_pose
+from processes import files_of_at_most
 
 SCENE = SceneConfig(
     num_agents=4,
@@ -407,6 +408,18 @@ def test_a_failed_export_leaves_the_old_artifact_alone(
     monkeypatch.setattr("eqrt.export.artifact.AGREEMENT_M", -1.0)  # nothing agrees that well
     with pytest.raises(EqrtError, match="differ"):
         write_artifact(model, SCENE.contract("test", "2.0.0"), CARD, copy, "Other weights.")
+    assert (copy / "SHA256SUMS").read_bytes() == before
+    assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]
+
+
+def test_an_export_that_the_disk_does_not_take_leaves_the_old_artifact_alone(
+    model: CompactPredictor, copy: Path
+) -> None:
+    before = (copy / "SHA256SUMS").read_bytes()
+    contract = SCENE.contract("test", "2.0.0")
+    cannot = rf"{copy.name}: cannot be written \(File too large\)"
+    with files_of_at_most(1 << 10), pytest.raises(EqrtError, match=cannot):
+        write_artifact(model, contract, CARD, copy, "Other weights.")
     assert (copy / "SHA256SUMS").read_bytes() == before
     assert sorted(path.name for path in copy.parent.iterdir()) == [copy.name]
 

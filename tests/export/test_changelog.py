@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from eqrt.core.errors import UsageError
+from eqrt.cli import main
+from eqrt.core.errors import EqrtError, UsageError
 from eqrt.export.changelog import FILE, changelog
 
 
@@ -45,3 +46,17 @@ def test_a_new_version_without_a_word_on_what_changed_is_refused(tmp_path: Path)
     exported(tmp_path, "1.0.0")
     with pytest.raises(UsageError, match=r"holds version 1\.0\.0; say what 1\.1\.0 changes"):
         changelog(tmp_path, "1.1.0", None)
+
+
+def test_words_that_are_no_text_any_more_are_named(tmp_path: Path) -> None:
+    exported(tmp_path, "1.0.0")
+    (tmp_path / FILE).write_bytes("## 1.0.0\n\nFür Städte.\n".encode("latin-1"))
+    with pytest.raises(EqrtError, match=r"CHANGELOG\.md: not UTF-8 any more .*save it as UTF-8"):
+        changelog(tmp_path, "1.1.0", "Faster.")
+
+
+@pytest.mark.parametrize("version", ["1.1 beta", "", "1.1\n"])
+def test_a_version_is_one_word(version: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The changelog would forget what another was about."""
+    assert main(["export", "model.safetensors", "--out", "a", "--model-version", version]) == 2
+    assert "is not one word, such as 1.1.0" in capsys.readouterr().err

@@ -83,6 +83,11 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
     assert set(contents(tmp_path).values()) == {"precious"}
 
 
+def test_the_root_of_all_folders_is_refused() -> None:
+    with pytest.raises(EqrtError, match="no place for an artifact"):
+        claim(Path("/"))
+
+
 def test_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "artifact").write_text("precious")
     with pytest.raises(EqrtError, match="artifact: not a folder; choose another --out"):

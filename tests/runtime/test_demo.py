@@ -12,8 +12,9 @@ import pytest
 
 from drives import first_seconds
 from eqrt.cli import main
+from eqrt.core.errors import EqrtError
 from eqrt.runtime.demo.command import PARTS, play_part
-from processes import eqrt
+from processes import eqrt, files_of_at_most
 
 LINE = re.compile(r"  +\d+ s  (RUN|LATE) +\d+ objects +\d+\.\d ms")
 TABLE = re.compile(r"  (eqrt|constant velocity) +" + r" +".join([r"\d+\.\d\d"] * 6))
@@ -81,6 +82,14 @@ def test_pictures_that_cannot_be_written_are_known_before_the_minute(
     assert out == ""
     assert err.startswith(f"eqrt: cannot write pictures to {tmp_path / 'file'} (")
     assert err.count("\n") == 1
+
+
+def test_a_picture_that_does_not_fit_on_the_disk_is_not_begun(tmp_path: Path) -> None:
+    part = next(part for part in PARTS if part.name == "ngsim")
+    result = play_part(part, 7.0)
+    with files_of_at_most(1 << 10), pytest.raises(EqrtError, match=r"a\.svg: cannot be written"):
+        result.write_picture(tmp_path / "a.svg")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_that_has_ended_is_said_to_have(

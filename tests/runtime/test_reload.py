@@ -10,16 +10,22 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 
 import can
 
-from drives import TILE, cycle
+from drives import TILE, cycle, shipped_predictor
 from eqrt.runtime.bus.buses import LOCAL, open_bus
+from eqrt.runtime.decoding.profile import load_profile
+from eqrt.runtime.operation.event_log import EventLog
+from eqrt.runtime.operation.reload import Reloader
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
+from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
-from handmade_model import CONTRACT, write_handmade
+from eqrt.runtime.prediction.protobuf import nested, text
+from handmade_model import CONTRACT, sign, write_handmade
 from processes import PATIENCE_S, Heard, Serving
 from two_tiles import CARS, POSE, other_tile
 
@@ -126,3 +132,21 @@ def test_a_reload_of_the_same_files_says_that_nothing_changed() -> None:
         status, stdout, stderr = service.end()
     assert (status, stderr) == (0, "")
     assert "reloaded: unchanged, model eqrt-free " in stdout
+
+
+def test_a_model_that_may_not_be_sold_is_said_to_be_one_when_it_is_taken(tmp_path: Path) -> None:
+    """As at the start of a service; the one before could be."""
+    model = write_handmade(tmp_path / "model")
+    with (model / "model.onnx").open("ab") as stream:
+        stream.write(nested(14, text(1, "non_commercial") + text(2, "true")))
+    sign(model)
+    pipeline, lines = Pipeline(load_profile("generic"), shipped_predictor()), StringIO()
+    log, told = EventLog(stream=lines), list[bool]()
+    reload = Reloader(pipeline, model, None, is_asked=lambda: True, log=log, tell=told.append)
+    give_up_s = time.monotonic() + PATIENCE_S
+    while told != [True, False]:
+        assert time.monotonic() < give_up_s
+        reload()
+    assert pipeline.predictor.contract.name == "handmade"
+    assert "warning: model licence: " in lines.getvalue()
+    assert lines.getvalue().endswith(", non-commercial (handmade)\n")

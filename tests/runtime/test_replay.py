@@ -28,6 +28,7 @@ from processes import EQRT, environment, eqrt
 from source_tree import ROOT
 
 NGSIM = DRIVES["ngsim"]
+RECORDING = "there/eqrt-20260301T101500Z-0badcafe-0000.mcap"
 KEYS = {  # of docs/output.md
     "cycle": int,
     "time_s": float,
@@ -182,6 +183,21 @@ def test_a_replay_that_fails_leaves_what_was_there(
     assert "there is no CAN message in it" in capsys.readouterr().err
     assert out.read_text() == "yesterday's\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.log", "out.jsonl"]
+
+
+@pytest.mark.parametrize("read", ["drive.log", "./there/../drive.log", "a.tile", RECORDING])
+def test_what_a_replay_reads_is_not_written_over(
+    read: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / RECORDING).write_text("an earlier run\n")
+    tile = tmp_path / "a.tile"
+    tile.write_bytes(Path(NGSIM.options[NGSIM.options.index("--tile") + 1]).read_bytes())
+    before = (tmp_path / read).read_bytes()
+    options = ["--profile", "generic", "--tile", str(tile), "--diff", str(tmp_path / "there")]
+    assert run(log, tmp_path / read, *options) == 2
+    assert "is read here and would be lost; choose another file" in capsys.readouterr().err
+    assert (tmp_path / read).read_bytes() == before
 
 
 def test_while_a_replay_writes_its_output_is_not_there(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +19,7 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.run_diff import Difference, compare_runs, table
 from forecast_sets import many
+from processes import EQRT, environment
 from source_tree import ROOT
 
 NGSIM = DRIVES["ngsim"]
@@ -107,6 +111,16 @@ def test_a_line_that_is_no_prediction_is_an_error() -> None:
         diff(run(), b'{"cycle": 1}\n')
 
 
+@pytest.mark.parametrize("trajectories", [b"[]", b'"far"', b"[[[1.0]]]"])
+def test_a_line_without_trajectories_is_an_error(trajectories: bytes) -> None:
+    line, *more = run().splitlines()
+    broken = re.sub(rb'"trajectories":.*', b'"trajectories":' + trajectories + b"}", line)
+    with pytest.raises(
+        LogError, match=r"object \d+ in the cycle at 0.000000 s has no trajectories"
+    ):
+        diff(run(), b"\n".join([broken, *more]))
+
+
 # --- the command
 
 
@@ -134,6 +148,26 @@ def test_another_model_differs(log: Path, capsys: pytest.CaptureFixture[str]) ->
     assert main(["replay", str(log), *options]) == 1
     rows = dict(line.rsplit(maxsplit=1) for line in capsys.readouterr().out.splitlines()[1:5])
     assert rows["  only in the replay"] == rows["  only in eqrt-small-6"] == "0"
+
+
+def test_predictions_are_there_although_nobody_reads_the_comparison(
+    log: Path, tmp_path: Path
+) -> None:
+    lines, again = tmp_path / "first.jsonl", tmp_path / "again.jsonl"
+    assert main(["replay", str(log), *NGSIM.options, "--out", str(lines)]) == 0
+    options = [*NGSIM.options, "--diff", str(lines), "--out", str(again)]
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "wb") as stdout:
+        done = subprocess.run(
+            [*EQRT, "replay", str(log), *options],
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+            env=environment(PYTHONUNBUFFERED="1"),
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (1, b"")
+    assert again.read_bytes() == lines.read_bytes()
 
 
 def test_a_replay_must_be_asked_for_something(

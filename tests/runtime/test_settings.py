@@ -144,6 +144,7 @@ def test_the_name_of_a_profile_is_not_taken_for_a_file(tmp_path: Path) -> None:
         ("[serve]\nout_modes = '1'\n", r"line 2: out_modes is \"1\", expected an integer"),
         ("[serve]\nout_id = 'z'\n", r"line 2: out_id: 'z' is not a CAN id"),
         ("[serve]\ntile = 3\n", r"line 2: tile is 3, expected a string"),
+        ('[serve]\ntile = "a\\u0000"\n', r"line 2: tile holds a null character"),
         ("[serve]\nlog_format = 'xml'\n", r"line 2: log_format is \"xml\", expected \"text\" or"),
         ("[realtime]\n\npriority = 100\n", r"line 3: priority: '100' is not a priority from 1"),
         ("[realtime]\ncpus = '3-1'\n", r"line 2: cpus: '3-1' names no cores"),
@@ -156,6 +157,18 @@ def test_a_wrong_file_is_refused_with_the_line(text: str, problem: str, tmp_path
         options("--config", str(written(tmp_path, text)))
     assert "\n" not in str(caught.value)
     assert "eqrt.toml" in str(caught.value)
+
+
+def test_a_file_may_begin_with_a_byte_order_mark_and_end_its_lines_as_windows_does(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "eqrt.toml"
+    path.write_bytes(NEEDED.replace("\n", "\r\n").encode("utf-8-sig") + b"quiet = true\r\n")
+    assert options("--config", str(path)).quiet is True
+    path.write_bytes(path.read_bytes() + b"fd = 1\r\n")
+    last = path.read_bytes().count(b"\n")
+    with pytest.raises(ConfigError, match=rf"line {last}: fd is 1, expected true or false"):
+        options("--config", str(path))
 
 
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:

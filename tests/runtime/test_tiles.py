@@ -43,6 +43,15 @@ def test_saving_replaces_the_old_tile_and_leaves_nothing_else(tmp_path: Path) ->
     assert path.stat().st_mode & 0o777 == 0o644
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="of links and devices as Linux has them")
+def test_a_device_is_written_and_stays_what_it_is(tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    nowhere.symlink_to("/dev/null")
+    save_tile(nowhere, TILE)
+    assert nowhere.is_symlink()
+    assert nowhere.is_char_device()
+
+
 def test_info_says_what_a_tile_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "straight.tile"
     save_tile(path, TILE)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eqrt.core.errors import EqrtError
+from eqrt.core.errors import EqrtError, UsageError
 from eqrt.core.frames import Pose2
 from eqrt.runtime.prediction.model_file import parse_model_file
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Prediction
@@ -37,7 +37,7 @@ from handmade_model import (
     with_initializer,
     write_handmade,
 )
-from processes import environment
+from processes import environment, files_of_at_most
 from source_tree import ROOT
 
 RESEARCH = ROOT / "deploy/models/eqrt-small-6"
@@ -386,9 +386,25 @@ def test_the_status_is_1_if_anything_failed(
     assert json.loads((tmp_path / "report.json").read_text())["verified"] is False
 
 
+def test_findings_that_do_not_fit_on_the_disk_are_printed_and_the_old_file_stays(
+    handmade: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "report.json"
+    report.write_text("yesterday's")
+    with files_of_at_most(1 << 10), pytest.raises(EqrtError, match="File too large"):
+        run(str(handmade), "--json", str(report))
+    assert "verified: all 16 checks passed" in capsys.readouterr().out
+    assert report.read_text() == "yesterday's"
+
+
 def test_what_is_no_folder_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EqrtError, match="no such folder; an artifact is one"):
         run(str(tmp_path / "nothing"))
+
+
+def test_a_seed_below_zero_is_refused() -> None:
+    with pytest.raises(UsageError, match="--seed is -1; give 0 or more"):
+        run("--seed", "-1")
 
 
 def test_a_model_file_is_read_without_the_onnx_package(handmade: Path) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from eqrt.export.to_onnx import to_onnx
 from eqrt.export.vectors import TURNED, TWINS, named_scenes
 from eqrt.runtime.prediction.predictor import Predictor, disagreement
 from eqrt.training.checkpoint import Card
+from eqrt.training.files import writing
 
 AGREEMENT_M = 1e-3
 """PyTorch and the file must agree within a millimetre (`disagreement`)."""
@@ -49,16 +51,13 @@ def write_artifact(
 
     `changes` says what is new in this version (`eqrt.export.changelog`). Returns the largest
     disagreement between PyTorch and the file in metres. Raises EqrtError if that is above
-    AGREEMENT_M, the runtime's own Predictor refuses the result, or something else than an artifact
-    is at `folder`; ValueError if the model's outputs are not the contract's.
+    AGREEMENT_M, the runtime's own Predictor refuses the result, something else than an artifact is
+    at `folder`, or it cannot be written; ValueError if the model's outputs are not the contract's.
     """
     folder = folder.resolve()
     claim(folder)
     log = changelog(folder, contract.version, changes)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
-        draft = Path(temporary) / folder.name
-        draft.mkdir()
+    with writing(folder), _draft_of(folder) as draft:
         metadata = {
             "data": card.data,
             "license": card.license,
@@ -80,6 +79,16 @@ def write_artifact(
         error = _read_back(draft, scenes, expected)
         put(draft, folder)
     return error
+
+
+@contextlib.contextmanager
+def _draft_of(folder: Path) -> Iterator[Path]:
+    """An empty folder on the disk of `folder`; gone at the end, unless it was moved."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
+        draft = Path(temporary) / folder.name
+        draft.mkdir()
+        yield draft
 
 
 def reference(model: nn.Module, scene: Scene) -> tuple[NDArray[np.float32], ...]:

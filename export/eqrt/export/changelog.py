@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from eqrt.core.errors import UsageError
+from eqrt.core.errors import EqrtError, UsageError
 
 FILE = "CHANGELOG.md"
 _TITLE = "# Changes\n"
@@ -19,7 +19,8 @@ def changelog(folder: Path, version: str, changes: str | None) -> str:
     """The text for `version` of the artifact that is to be at `folder`.
 
     A version that is there already keeps its place, and its words too unless `changes` has others.
-    Raises UsageError for another version than those there without a word on what changed.
+    Raises UsageError for another version than those there without a word on what changed, EqrtError
+    if what is there is no text.
     """
     entries = _entries(folder)
     if changes is None and version not in entries:
@@ -41,4 +42,8 @@ def _entries(folder: Path) -> dict[str, str]:
     path = folder / FILE
     if not path.exists():
         return {}
-    return dict(_ENTRY.findall(path.read_text(encoding="utf-8")))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise EqrtError(f"{path}: not UTF-8 any more ({error}); save it as UTF-8") from error
+    return dict(_ENTRY.findall(text))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
 from eqrt.export.artifact import write_artifact
@@ -13,7 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `eqrt export`."""
     parser.add_argument("checkpoint", type=Path, help="model.safetensors of `eqrt train`")
     parser.add_argument("--out", type=Path, required=True, help="folder of the artifact")
-    parser.add_argument("--model-version", default="1.0.0", help="default 1.0.0")
+    parser.add_argument(
+        "--model-version", type=_version, default="1.0.0", help="one word, default 1.0.0"
+    )
     parser.add_argument(
         "--changes", metavar="TEXT", help="what this version changes, for its CHANGELOG.md"
     )
@@ -33,3 +36,10 @@ def run(args: argparse.Namespace) -> int:
     limits = ", non-commercial" if card.non_commercial else ""
     print(f"licence        {card.license}{limits}")
     return 0
+
+
+def _version(text: str) -> str:
+    """A word, as the titles in CHANGELOG.md are; argparse turns the error into a usage message."""
+    if not re.fullmatch(r"\S+", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not one word, such as 1.1.0")
+    return text

@@ -22,6 +22,8 @@ def claim(folder: Path) -> None:
     What a killed export left aside is put back, or deleted where the new one is in place. Raises
     EqrtError that names what is there.
     """
+    if not folder.name:
+        raise EqrtError(f"{folder}: no place for an artifact; give --out a folder with a name")
     _settle(folder)
     if not folder.exists():
         return

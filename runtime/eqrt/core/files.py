@@ -7,7 +7,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import stat
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 
 def may_be_file(path: Path) -> bool:
@@ -31,16 +34,43 @@ def read_at_most(max_bytes: int, path: Path) -> bytes:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """A file that appears when it is whole, and stays what it was if it cannot be; what is no file
-    (a device, a pipe) is written as it is. Raises OSError.
+    """Write a file as `whole` does. Raises OSError."""
+    with whole(path) as stream:
+        stream.write(content)
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[BinaryIO]:
+    """To write a file that appears when it is whole, and stays what it was if it cannot be.
+
+    Links stay links. What is no file (a device, a pipe) is written as it is, and so is what our
+    output goes to anyway, such as /dev/stdout. Raises OSError.
     """
-    if not may_be_file(path) and path.exists():
-        path.write_bytes(content)
+    if (as_it_is := _open_as_it_is(path)) is not None:
+        with as_it_is as stream:
+            yield stream
         return
-    part = path.parent / f"{path.name}.part"
+    place = Path(os.path.realpath(path))
+    part = place.parent / f".{place.name}.{os.getpid()}.part"
     try:
-        part.write_bytes(content)
-        part.replace(path)
+        with part.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())  # else a power cut may leave the new name on an empty file
+        part.replace(place)
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def _open_as_it_is(path: Path) -> BinaryIO | None:
+    """None = another file may take its place, or there is none yet."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None  # if it is there, but not to be seen, writing it says why
+    for number in (1, 2):
+        with contextlib.suppress(OSError):
+            if os.path.samestat(found, os.fstat(number)):
+                return os.fdopen(os.dup(number), "wb")
+    return None if stat.S_ISREG(found.st_mode) else path.open("wb")

@@ -22,6 +22,7 @@ from typing import BinaryIO
 import can
 
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.files import whole
 from eqrt.runtime.advice import no_predictions
 from eqrt.runtime.bus.channels import parse_channels
 from eqrt.runtime.bus.logs import read_log
@@ -30,9 +31,10 @@ from eqrt.runtime.output.forecasts import ForecastSet, Mode
 from eqrt.runtime.output.json_lines import json_lines
 from eqrt.runtime.pipeline import Pipeline
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
+from eqrt.runtime.recording.folder import recordings_in
 from eqrt.runtime.recording.reader import is_recording, read_recordings
 from eqrt.runtime.recording.replaying import Instead, LeftOut, Replay
-from eqrt.runtime.run_diff import compare_runs, table
+from eqrt.runtime.run_diff import Difference, compare_runs, table
 from eqrt.runtime.serve import load_pipeline
 from eqrt.runtime.serve_options import add_pipeline_arguments
 
@@ -91,23 +93,37 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("where should the predictions go? give --out FILE, or --diff RUN")
     replayed = _replay_of(args, args.model)
     out_name = args.out if args.out is not None else os.devnull
+    _check_not_read(out_name, args)
     compares = args.diff is not None or args.diff_model is not None
     modes: Counter[Mode] = Counter()
     started_s = time.perf_counter()
     with output(out_name) as out:
         lines = _written(replayed, out, modes)
-        status = _compare(args, lines, replayed) if compares else _exhaust(lines)
+        compared = _compare(args, lines, replayed) if compares else _exhaust(lines)
         if not (compares or replayed.left_out or _predictions(replayed)):
             _say(replayed, modes, time.perf_counter() - started_s)
             raise EqrtError(f"no predictions: {no_predictions(replayed.pipelines[-1])}")
+    status = 0 if compared is None else _tell(args, *compared)
     _say(replayed, modes, time.perf_counter() - started_s)
     return PARTLY if status == 0 and replayed.left_out else status
 
 
-def _exhaust(lines: Iterator[bytes]) -> int:
+def _check_not_read(out_name: str, args: argparse.Namespace) -> None:
+    """UsageError if the predictions would take the place of what they are made of."""
+    out = Path(out_name)
+    if out_name == "-" or not out.is_file():
+        return
+    given = [Path(one) for one in (args.log, args.profile, args.tile, args.diff) if one is not None]
+    files = [file for one in given for file in (recordings_in(one) if one.is_dir() else [one])]
+    if any(file.is_file() and file.samefile(out) for file in files):
+        raise UsageError(f"--out {out} is read here and would be lost; choose another file")
+
+
+def _exhaust(lines: Iterator[bytes]) -> tuple[Difference, str] | None:
+    """There is nothing to compare with."""
     for _ in lines:
         pass
-    return 0
+    return None
 
 
 def _predictions(replayed: _LogReplay | _RecordingReplay) -> int:
@@ -145,14 +161,19 @@ def _written(
 
 def _compare(
     args: argparse.Namespace, lines: Iterator[bytes], replayed: _LogReplay | _RecordingReplay
-) -> int:
+) -> tuple[Difference, str]:
+    """How the replay differs from another run, and what that is called."""
     if args.diff is not None:
         other, name = _lines_of(args.diff), args.diff.name
     else:
         forecasts = _replay_of(args, args.diff_model, everywhere=True)
         other = (line for forecast in forecasts for line in json_lines(forecast).splitlines())
         name = args.diff_model.name
-    found = compare_runs(lines, other, replayed.is_left_out)
+    return compare_runs(lines, other, replayed.is_left_out), name
+
+
+def _tell(args: argparse.Namespace, found: Difference, name: str) -> int:
+    """Print the difference; returns the exit status."""
     text = table(found, "the replay", name)
     print(text, end="", file=sys.stderr if args.out == "-" else sys.stdout)
     if found.is_none:
@@ -306,18 +327,10 @@ def output(name: str) -> Iterator[BinaryIO]:
         yield sys.stdout.buffer
         return
     path = Path(name)
-    in_place = path.exists() and not path.is_file()  # a device or a pipe
-    written = path if in_place else path.parent / f"{path.name}.part"
     try:
-        with written.open("wb") as stream:
+        with whole(path) as stream:
             yield stream
-        if not in_place:
-            os.replace(written, path)
     except OSError as error:
         raise EqrtError(
             f"cannot write {path} ({error.strerror}); give --out a file that can be written"
         ) from error
-    finally:
-        if not in_place:
-            with contextlib.suppress(OSError):
-                written.unlink(missing_ok=True)

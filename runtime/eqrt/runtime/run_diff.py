@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from eqrt.core.errors import LogError, in_one_line
 
@@ -256,8 +257,19 @@ def _compare_targets(one: _Target, other: _Target, found: Difference) -> None:
 
 def _apart_m(one: _Target, other: _Target) -> float | None:
     """How far the most probable trajectories are apart at most, as far as both go."""
-    mine, theirs = (np.array(_TRAJECTORIES.decode(x.trajectories)[0]) for x in (one, other))
+    mine, theirs = _most_probable(one), _most_probable(other)
     steps = min(len(mine), len(theirs))
     if not steps or one.dt_s != other.dt_s:
         return None
     return float(np.linalg.norm(mine[:steps] - theirs[:steps], axis=-1).max())
+
+
+def _most_probable(target: _Target) -> NDArray[np.float64]:
+    """(H, 2) metres. Raises LogError if the line has something else there."""
+    try:
+        return np.array(_TRAJECTORIES.decode(target.trajectories)[0])
+    except (msgspec.MsgspecError, IndexError) as error:
+        raise LogError(
+            f"object {target.object_id} in the cycle at {target.time_s:.6f} s has no trajectories "
+            f"({in_one_line(error)}); `eqrt replay --out` writes JSON lines"
+        ) from error

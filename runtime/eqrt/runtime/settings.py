@@ -194,7 +194,8 @@ class _File:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._text = read_at_most(MAX_FILE_BYTES, path).decode("utf-8")
+            content = read_at_most(MAX_FILE_BYTES, path)
+            self._text = content.decode("utf-8-sig")  # some editors begin with a mark
             self._values = tomllib.loads(self._text)
         except OSError as error:
             raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from error
@@ -236,6 +237,8 @@ class _File:
     def _scalar(self, option: Option, value: Any, place: list[str]) -> Any:
         """As the command line would have it; a relative path begins at the file's own folder."""
         kind = option.action.type
+        if isinstance(value, str) and "\0" in value:
+            raise self._error(place, f"{place[-1]} holds a null character, which no name can have")
         if kind is Path:
             return self._path.parent / value
         if kind is FileOrName:
@@ -264,7 +267,7 @@ def line_of(text: str, place: Sequence[str]) -> int:
 
     The shortest beginning of the document that is TOML and has the key ends with its statement.
     """
-    lines = text.split("\n")
+    lines = text.replace("\r\n", "\n").split("\n")
     begins = 0
     for end in range(1, len(lines) + 1):
         try:

@@ -12,6 +12,7 @@ import pytest
 
 from bench_reports import bench, bench_for_real, case, report
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.runtime.bench import options
 from eqrt.runtime.bench.environment import (
     allow_cores,
     allowed_cores,
@@ -22,6 +23,7 @@ from eqrt.runtime.bench.json_form import to_json
 from eqrt.runtime.bench.predictors import ModelWorkload, load_timed
 from eqrt.runtime.bench.scenes import shuffled
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
+from processes import files_of_at_most
 
 ARM = "processor : 0\nModel : Board 5\nFeatures : fp asimd asimddp crc32\n"
 INTEL = "model name : Xeon\nflags : fpu sse2 avx2 fma avx512f avx512_vnni amx_int8 hypervisor\n"
@@ -144,15 +146,36 @@ def test_wrong_usage_is_refused_in_one_line_before_anything_is_measured(
     [
         (["--json", "nowhere/report.json"], "nowhere/report.json: cannot be written"),
         (["--html", "."], r"\.: cannot be written"),
+        (["--html", "/proc/report.html"], r"/proc/report.html: cannot be written \(No such file"),
     ],
 )
 def test_a_report_that_cannot_be_written_is_known_before_anything_is_measured(
-    arguments: list[str], said: str
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The command line is right; the folder is not, and that can be mended: status 1."""
     with pytest.raises(EqrtError, match=said) as error:
         bench(*arguments)
     assert error.value.exit_code == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_two_reports_do_not_go_into_one_file(tmp_path: Path) -> None:
+    """Except into none at all."""
+    (tmp_path / "b").mkdir()
+    with pytest.raises(UsageError, match="is to be two reports at once"):
+        bench("--json", str(tmp_path / "a"), "--html", str(tmp_path / "b/../a"))
+    options.check_writable(Path("/dev/null"), Path("/dev/null"))
+
+
+def test_a_report_that_does_not_fit_on_the_disk_leaves_the_old_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = tmp_path / "report.json"
+    written.write_text("yesterday's")
+    with files_of_at_most(1 << 10), pytest.raises(EqrtError, match="File too large"):
+        bench("--targets", "1", "--seconds", "0.1", "--json", str(written))
+    assert "1 target, ms" in capsys.readouterr().out
+    assert written.read_text() == "yesterday's"
 
 
 def test_a_folder_that_is_no_artifact_is_refused(tmp_path: Path) -> None:

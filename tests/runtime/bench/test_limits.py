@@ -101,6 +101,12 @@ def test_a_budget_needs_a_schedule_and_its_rate(tmp_path: Path, schedule: str) -
         load_budget(budget_of(tmp_path, "", schedule))
 
 
+def test_a_budget_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    budget = budget_of(tmp_path, "[targets.1]\np50_ms = 1\n")
+    budget.write_bytes(b"\xef\xbb\xbf" + budget.read_bytes())
+    assert load_budget(budget).targets == {1: {"p50_ms": 1}}
+
+
 def test_a_missing_budget_is_named() -> None:
     with pytest.raises(EqrtError, match=r"nowhere.toml: cannot be read \(No such file"):
         load_budget(Path("nowhere.toml"))

@@ -66,11 +66,11 @@ def load_budget(path: Path, benchmark: str = MODEL) -> Budget:
     Raises EqrtError if it cannot be read or has a key that nothing stands for.
     """
     try:
-        with path.open("rb") as stream:
-            values = tomllib.load(stream)
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin with a mark
+        values = tomllib.loads(text)
     except OSError as error:
         raise EqrtError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:  # not TOML, or not UTF-8
+    except (ValueError, RecursionError) as error:  # neither TOML nor UTF-8, or far too deep
         raise EqrtError(f"{path}: not TOML ({error})") from error
     _known(path, "", values, _KEYS)
     parts: dict[str, Mapping[str, Any]] = {

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import write_whole
 from eqrt.runtime.bench import options
 from eqrt.runtime.bench.baseline import Comparison, compare, load_baseline
 from eqrt.runtime.bench.budget import Budget, broken, check_duty, load_budget
@@ -108,7 +109,7 @@ def _write(path: Path | None, text: str) -> None:
     if path is None:
         return
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode())
     except OSError as error:
         raise EqrtError(f"{path}: cannot be written ({error.strerror})") from error
 

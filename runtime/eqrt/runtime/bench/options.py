@@ -7,6 +7,7 @@ side by side. An option that the chosen one cannot keep is refused.
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -242,10 +243,20 @@ def artifact_of(args: argparse.Namespace) -> Path:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Now, because minutes later a report would be lost."""
-    for path in paths:
-        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+    """Now, because minutes later a report would be lost. Raises EqrtError."""
+    given = [path for path in paths if path is not None]
+    for path in given:
+        if path.is_dir() or not path.parent.is_dir():
             raise EqrtError(f"{path}: cannot be written; give a file in a folder that exists")
+    files = [path.resolve() for path in given if path.is_file() or not path.exists()]
+    for path in files:
+        if files.count(path) > 1:
+            raise UsageError(f"{path} is to be two reports at once; give each a file of its own")
+        try:
+            with tempfile.TemporaryFile(dir=path.parent):
+                pass
+        except OSError as error:
+            raise EqrtError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _rate(args: argparse.Namespace, benchmark: str, schedule: str) -> float | None:

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from eqrt.core.errors import EqrtError, UsageError
+from eqrt.core.files import write_whole
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.demo.picture import render
 from eqrt.runtime.demo.programs import eqrt, running
@@ -157,11 +158,14 @@ class PartResult:
         print(f"  verdict    {_verdict(ours['fde_3s'], baseline['fde_3s'])}")
 
     def write_picture(self, path: Path) -> Path | None:
-        """One moment of the part as SVG, or None if none could be scored."""
+        """One moment of the part as SVG, or None if none could be scored. Raises EqrtError."""
         moment = self.moment.picture(load_tile(self.part.tile) if self.part.tile else None)
         if moment is None:
             return None
-        path.write_text(render(moment), encoding="utf-8")
+        try:
+            write_whole(path, render(moment).encode())
+        except OSError as error:
+            raise EqrtError(f"{path}: cannot be written ({error.strerror})") from error
         return path.resolve()
 
 

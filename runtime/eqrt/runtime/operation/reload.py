@@ -93,6 +93,8 @@ class Reloader:
         self._pipeline.exchange(result.predictor, result.tile, result.lanes)
         self._exchanged()
         self._log.say(Level.INFO, "reload", f"reloaded: {after}, before {before}")
+        if notice := result.predictor.license_notice:
+            self._log.say(Level.WARNING, "license", notice)
 
 
 def identity(predictor: Model, tile: Tile | None) -> str:

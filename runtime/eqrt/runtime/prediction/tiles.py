@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from eqrt.core.errors import TileError
+from eqrt.core.files import write_whole
 from eqrt.core.lanes import LaneMap
 from eqrt.core.tile import MAX_FILE_BYTES, TileInfo, decode
 
@@ -43,18 +42,7 @@ def save_tile(path: Path, data: bytes) -> None:
 
     Raises TileError, naming the file, if it cannot be written.
     """
-    temporary = None
     try:
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f".{path.name}.", delete=False
-        ) as file:
-            temporary = Path(file.name)
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)  # a temporary file is private
-        temporary.replace(path)
+        write_whole(path, data)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise TileError(f"{path}: the tile cannot be written ({error.strerror})") from error

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from eqrt.core.errors import ContractError, EqrtError
+from eqrt.core.errors import ContractError, EqrtError, UsageError
+from eqrt.core.files import write_whole
 from eqrt.runtime.prediction.model_file import read_model_file
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT, Predictor
 from eqrt.runtime.prediction.stored_vectors import StoredVector, read_vector, vector_folders
@@ -66,15 +67,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the findings; 0 if everything is as promised, else 1."""
+    if args.seed < 0:
+        raise UsageError(f"--seed is {args.seed}; give 0 or more")
     if not args.artifact.is_dir():
         raise ContractError(f"{args.artifact}: no such folder; an artifact is one")
     report = verify(args.artifact, args.seed)
+    print(render(report))
     if args.json is not None:
         try:
-            args.json.write_text(report.to_json() + "\n", encoding="utf-8")
+            write_whole(args.json, f"{report.to_json()}\n".encode())
         except OSError as error:
             raise EqrtError(f"{args.json}: cannot be written ({error.strerror})") from error
-    print(render(report))
     return 0 if report.verified else 1
 
 
