@@ -36,7 +36,7 @@ def best_mode_loss(
 def soft_mode_loss(
     trajectories: Tensor, probabilities: Tensor, future: Tensor, valid: Tensor
 ) -> Tensor:
-    """The best mode is pulled to the truth, its end most; all learn how likely they are.
+    """The best mode is pulled to the truth, its end a little more; all learn how likely they are.
 
     Best is the mode that ends nearest, as Argoverse counts: the ADE of that one is minADE. The
     likelihood to learn is soft: a mode that comes nearly as close as the best is nearly as right.
@@ -52,7 +52,7 @@ def soft_mode_loss(
 
 SOFTNESS_M = 1.0
 """Modes whose errors differ by less are about as likely."""
-FINAL_SHARE = 0.3
+FINAL_SHARE = 0.1
 LIKELIHOOD_SHARE = 0.7
 
 
