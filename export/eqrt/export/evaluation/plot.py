@@ -157,10 +157,11 @@ def _errors(windows: Windows, outcome: Outcome) -> list[str]:
     said = []
     for row, course in enumerate(distance[:, 0]):
         text = f"ADE {course.mean():.2f}, FDE {course[-1]:.2f} m"
+        text += f"; const. velocity FDE {velocity[row]:.2f} m"
         if modes > 1:
             best = likeliest[row : row + 1]
-            text += f"; best of {modes} {min_ade(best)[0]:.2f}, {min_fde(best)[0]:.2f} m"
-        said.append(f"{text}; const. velocity FDE {velocity[row]:.2f} m")
+            text += f"\nbest of {modes}: ADE {min_ade(best)[0]:.2f}, FDE {min_fde(best)[0]:.2f} m"
+        said.append(text)
     return said
 
 
