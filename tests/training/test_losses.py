@@ -8,10 +8,12 @@ import torch
 from eqrt.training.losses import (
     FINAL_SHARE,
     LIKELIHOOD_SHARE,
+    NEAREST_END_SHARE,
     SPREAD_SHARE,
     ade_loss,
     best_mode_loss,
     mode_displacement,
+    nearest_end_loss,
     soft_mode_loss,
     spread_loss,
     whole_loss,
@@ -61,6 +63,19 @@ def test_a_soft_mode_that_is_as_good_is_as_likely() -> None:
     even = soft_mode_loss(equal, torch.tensor([[0.5, 0.5]]), FUTURE, VALID)
     assert even < soft_mode_loss(equal, torch.tensor([[0.8, 0.2]]), FUTURE, VALID)
     assert even < soft_mode_loss(equal, torch.tensor([[0.2, 0.8]]), FUTURE, VALID)
+
+
+def test_the_mode_that_ends_nearest_is_pulled_though_another_was_nearer_on_the_way() -> None:
+    """One 2 m off all the way; the other 6 m off first, and 1 m in the end."""
+    modes = torch.zeros(1, 2, 4, 2)
+    modes[0, 0, :, 0], modes[0, 1, 0, 1], modes[0, 1, 1, 1] = 2.0, 6.0, 1.0
+    first = torch.tensor([[1.0, 0.0]])
+    ade, fde = torch.tensor([2.0, 3.5]), torch.tensor([2.0, 1.0])
+    surprise = -float((-(ade + fde)).softmax(-1)[1] * np.log(1e-6))
+    nearest = 3.5 + NEAREST_END_SHARE * 1.0 + LIKELIHOOD_SHARE * surprise
+    torch.testing.assert_close(nearest_end_loss(modes, first, FUTURE, VALID), torch.tensor(nearest))
+    best = 2.0 + FINAL_SHARE * 2.0 + LIKELIHOOD_SHARE * surprise
+    torch.testing.assert_close(soft_mode_loss(modes, first, FUTURE, VALID), torch.tensor(best))
 
 
 def two_spreads() -> torch.Tensor:

@@ -36,24 +36,46 @@ def best_mode_loss(
 def soft_mode_loss(
     trajectories: Tensor, probabilities: Tensor, future: Tensor, valid: Tensor
 ) -> Tensor:
-    """The best mode is pulled to the truth, its end a little more; all learn how likely they are.
+    """The best mode is pulled to the truth, its end most; every mode learns how likely it is.
 
-    Best is the mode that ends nearest, as Argoverse counts: the ADE of that one is minADE. The
-    likelihood to learn is soft: a mode that comes nearly as close as the best is nearly as right.
+    Best is the mode with the least ADE plus half its final error. The likelihood to learn is soft:
+    a mode that comes nearly as close as the best is nearly as right.
     """
     ade = mode_displacement(trajectories, future, valid)  # (B, K)
     fde = _final_displacement(trajectories, future, valid)
-    best = fde.argmin(-1, keepdim=True)
-    soft = (-(ade + fde).detach() / SOFTNESS_M).softmax(-1)
-    likelihood = (soft * probabilities.clamp(min=_TINY).log()).sum(-1)
-    pull = ade.gather(1, best) + FINAL_SHARE * fde.gather(1, best)
-    return pull.mean() - LIKELIHOOD_SHARE * likelihood.mean()
+    pull = _of_least(ade + 0.5 * fde, ade + FINAL_SHARE * fde)
+    return pull.mean() + LIKELIHOOD_SHARE * _surprise(ade + fde, probabilities)
+
+
+def nearest_end_loss(
+    trajectories: Tensor, probabilities: Tensor, future: Tensor, valid: Tensor
+) -> Tensor:
+    """As `soft_mode_loss`, but best is the mode that ends nearest, and its end counts less.
+
+    Argoverse takes the ADE of that mode for minADE.
+    """
+    ade = mode_displacement(trajectories, future, valid)  # (B, K)
+    fde = _final_displacement(trajectories, future, valid)
+    pull = _of_least(fde, ade + NEAREST_END_SHARE * fde)
+    return pull.mean() + LIKELIHOOD_SHARE * _surprise(ade + fde, probabilities)
 
 
 SOFTNESS_M = 1.0
 """Modes whose errors differ by less are about as likely."""
-FINAL_SHARE = 0.1
+FINAL_SHARE = 0.3
+NEAREST_END_SHARE = 0.1
 LIKELIHOOD_SHARE = 0.7
+
+
+def _of_least(error: Tensor, value: Tensor) -> Tensor:
+    """The value (B, 1) of the mode whose error is least; both (B, K)."""
+    return value.gather(1, error.argmin(-1, keepdim=True))
+
+
+def _surprise(error: Tensor, probabilities: Tensor) -> Tensor:
+    """Cross entropy of the probabilities (B, K) with how likely modes of such errors are."""
+    soft = (-error.detach() / SOFTNESS_M).softmax(-1)
+    return -(soft * probabilities.clamp(min=_TINY).log()).sum(-1).mean()
 
 
 def _final_displacement(trajectories: Tensor, future: Tensor, valid: Tensor) -> Tensor:
@@ -77,6 +99,7 @@ LOSSES: Mapping[str, Loss] = {
     "ade": ade_loss,
     "best_mode": best_mode_loss,
     "soft_mode": soft_mode_loss,
+    "nearest_end": nearest_end_loss,
 }
 """What a configuration may name."""
 
