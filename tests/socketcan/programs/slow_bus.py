@@ -30,6 +30,7 @@ ROOM = 10  # messages; what the kernel gives a CAN interface unless told otherwi
 CLASSIC, FD = "500kbit", "1440kbit"  # 0.26 ms for 16 bytes of the kernel, 0.4 ms for 72
 TOO_SLOW = "20kbit"
 CYCLES, OBJECTS, PERIOD_S = 10, 32, 0.2
+CYCLE_S = 0.1  # of a sensor
 STATUS, OBJECT, POINT, NUM_OBJECTS_BYTE = 0x6E2, 0x6E4, 0x6E5, 3  # of eqrt.dbc
 PATIENCE_S, ANSWER_S = 20.0, 2.0
 CARS = [Car(object_id=i, x_m=10.0 + 5.0 * i, y_m=3.0) for i in range(6)]
@@ -78,9 +79,11 @@ def served() -> object:
     answers = []
     with listening("vcan1") as ear:
         for step in range(CYCLES):
-            for message in cycle(CARS, 0.1 * step, pose=Pose2()):
+            next_s = time.monotonic() + CYCLE_S  # cycles that come closer share a prediction
+            for message in cycle(CARS, CYCLE_S * step, pose=Pose2()):
                 sensor.send(message)
             answers.append(answer(ear))
+            time.sleep(max(0.0, next_s - time.monotonic()))
     sensor.shutdown()
     serve.send_signal(signal.SIGTERM)
     return {"status": serve.wait(PATIENCE_S), "answers": [one for one in answers if one[0]]}
