@@ -70,10 +70,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="make fuzz", description=__doc__)
-    parser.add_argument("targets", nargs="*", metavar="TARGET", default=[])
+    parser.add_argument(
+        "targets", nargs="*", metavar="TARGET", default=[], help=f"of {', '.join(ALL)}"
+    )
     parser.add_argument("--seconds", type=int, default=60, help="per target (default 60)")
     parser.add_argument("--jobs", type=int, default=1, help="targets at a time (default 1)")
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if unknown := [name for name in args.targets if name not in ALL]:
+        parser.error(f"no target {unknown[0]!r}; there are {', '.join(ALL)}")
+    return args
 
 
 def _fuzz(target: Target, seconds: int) -> Result:

@@ -102,14 +102,14 @@ def _check_sizes(tokens: list[str], where: str) -> None:
     if tokens[0] == "BO_":  # BO_ 1024 Name : 8 Sender
         if _exceed(tokens[4:5], MAX_MESSAGE_BYTES):
             raise ProfileError(
-                f"{where}: the message {tokens[2][:60]} has {tokens[4][:20]} bytes; no message "
+                f"{where}: the message {_named(tokens[2])} has {tokens[4][:20]} bytes; no message "
                 f"has more than {MAX_MESSAGE_BYTES}"
             )
     elif tokens[0] == "SG_":  # SG_ Name m0 : 7|16@0+ (1,0) [0|0] "m" Receiver
         place = tokens[tokens.index(":") :][1:4:2] if ":" in tokens else []
         if _exceed(place, 8 * MAX_MESSAGE_BYTES):
             raise ProfileError(
-                f"{where}: the signal {tokens[1][:60]} lies beyond the {MAX_MESSAGE_BYTES} bytes "
+                f"{where}: the signal {_named(tokens[1])} lies beyond the {MAX_MESSAGE_BYTES} bytes "
                 "that a message may have"
             )
     elif tokens[0] == "SG_MUL_VAL_":  # SG_MUL_VAL_ 1024 Name Multiplexer 1-5, 7-7 ;
@@ -117,9 +117,14 @@ def _check_sizes(tokens: list[str], where: str) -> None:
         count = sum(map(_num_values, numbers[::2], numbers[1::2]))
         if count > MAX_MULTIPLEXED:
             raise ProfileError(
-                f"{where}: SG_MUL_VAL_ of {tokens[2][:60]} lists {count:.3g} values of a "
+                f"{where}: SG_MUL_VAL_ of {_named(tokens[2])} lists {count:.3g} values of a "
                 f"multiplexer; no more than {MAX_MULTIPLEXED} are read"
             )
+
+
+def _named(token: str) -> str:
+    """A name for a message; where it is a text that never ended, the beginning of it."""
+    return " ".join(token[:60].split())
 
 
 def _exceed(numbers: list[str], limit: int) -> bool:
