@@ -109,8 +109,8 @@ def _check_sizes(tokens: list[str], where: str) -> None:
         place = tokens[tokens.index(":") :][1:4:2] if ":" in tokens else []
         if _exceed(place, 8 * MAX_MESSAGE_BYTES):
             raise ProfileError(
-                f"{where}: the signal {_named(tokens[1])} lies beyond the {MAX_MESSAGE_BYTES} bytes "
-                "that a message may have"
+                f"{where}: the signal {_named(tokens[1])} lies beyond the {MAX_MESSAGE_BYTES} "
+                "bytes that a message may have"
             )
     elif tokens[0] == "SG_MUL_VAL_":  # SG_MUL_VAL_ 1024 Name Multiplexer 1-5, 7-7 ;
         numbers = [token for token in tokens[4:-1] if token != ","]
