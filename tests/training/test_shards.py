@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +18,7 @@ from eqrt.training.dataset.shards import (
     shard_folder,
 )
 from eqrt.training.dataset.windows import TENSORS, Windows, join, no_windows
+from processes import files_of_at_most
 from window_samples import CONTRACT, assert_same, scenario_windows
 
 
@@ -98,20 +96,9 @@ def test_an_error_on_the_way_leaves_nothing(tmp_path: Path, windows: Windows) ->
     assert not list(tmp_path.iterdir())
 
 
-@contextmanager
-def file_size_limit(size: int) -> Iterator[None]:
-    """Writing fails beyond that, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def test_a_full_disk_is_said_and_leaves_nothing(tmp_path: Path, windows: Windows) -> None:
     with (
-        file_size_limit(100_000),
+        files_of_at_most(100_000),
         pytest.raises(EqrtError, match=r"shard-00003: cannot be written \(File too large\)"),
     ):
         write(tmp_path, *[windows] * 20)

@@ -12,6 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+PART = ".part"
+"""How the hidden names of what `whole` has not yet finished end; a process that was killed leaves
+them behind."""
+
 
 def may_be_file(path: Path) -> bool:
     """Whether there is such a file; True where that cannot be told, because the folder may not be
@@ -51,7 +55,7 @@ def whole(path: Path) -> Iterator[BinaryIO]:
             yield stream
         return
     place = Path(os.path.realpath(path))
-    part = place.parent / f".{place.name}.{os.getpid()}.part"
+    part = place.parent / f".{place.name}.{os.getpid()}{PART}"
     try:
         with part.open("wb") as stream:
             yield stream

@@ -23,7 +23,7 @@ from bench.systems.accuracy import Errors, read_errors
 from bench.systems.chosen import all_systems, config_name, folder_name
 from bench.systems.origin import is_made_by, origin_of
 from bench.systems.pages import PLOT, naive_table, plot, write_tables
-from eqrt.runtime.bench.environment import read_environment
+from eqrt.runtime.bench.environment import allowed_cores
 from eqrt.runtime.bench.json_form import to_json
 from eqrt.runtime.bench.options import COMPARISON
 from eqrt.runtime.bench.report import BACK_TO_BACK, Settings
@@ -58,7 +58,7 @@ def export_all(names: Sequence[str], configs: Path, models: Path) -> None:
     Each in a process of its own, so that this one never loads torch.
     """
     models.mkdir(parents=True, exist_ok=True)
-    cores = len(read_environment().cores_allowed)
+    cores = len(allowed_cores())
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
 
     def export(name: str) -> None:

@@ -12,7 +12,8 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from eqrt.core.errors import EqrtError
-from eqrt.training.files import write_whole, writing
+from eqrt.core.files import write_whole
+from eqrt.training.files import writing
 from eqrt.training.networks.registry import ModelConfig, build_network
 
 

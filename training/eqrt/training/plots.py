@@ -10,7 +10,8 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from eqrt.training.files import write_whole, writing
+from eqrt.core.files import write_whole
+from eqrt.training.files import writing
 from eqrt.training.progress import Numbers, read_lines
 
 FORMATS = ("png", "svg")

@@ -13,7 +13,8 @@ from typing import IO, Protocol, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from eqrt.training.files import write_whole, writing
+from eqrt.core.files import write_whole
+from eqrt.training.files import writing
 
 Numbers = Mapping[str, float]
 

@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from eqrt.runtime.bench.schedule import CLOCK, Clock
+from eqrt.runtime.bench.schedule import CLOCK
 
 _BYTES = 16 * 1024
 """Half of a small first-level cache."""
@@ -19,20 +19,20 @@ _WAIT_NS = 30_000_000
 _TIMES = 25
 
 
-def cooling(clock: Clock = CLOCK) -> float:
+def cooling() -> float:
     """How many times as long a sum of 16 KiB takes after 30 ms as at once: medians, in 0.8 s."""
     numbers = np.ones(_BYTES // 8)
-    return round(_sum_ns(numbers, _WAIT_NS, clock) / max(_sum_ns(numbers, 0, clock), 1.0), 1)
+    return round(_sum_ns(numbers, _WAIT_NS) / max(_sum_ns(numbers, 0), 1.0), 1)
 
 
-def _sum_ns(numbers: NDArray[np.float64], wait_ns: int, clock: Clock) -> float:
-    return median(_once_ns(numbers, wait_ns, clock) for _ in range(_TIMES))
+def _sum_ns(numbers: NDArray[np.float64], wait_ns: int) -> float:
+    return median(_once_ns(numbers, wait_ns) for _ in range(_TIMES))
 
 
-def _once_ns(numbers: NDArray[np.float64], wait_ns: int, clock: Clock) -> int:
-    until_ns = clock() + wait_ns
-    while clock() < until_ns:
+def _once_ns(numbers: NDArray[np.float64], wait_ns: int) -> int:
+    until_ns = CLOCK() + wait_ns
+    while CLOCK() < until_ns:
         pass
-    begun_ns = clock()
+    begun_ns = CLOCK()
     numbers.sum()
-    return clock() - begun_ns
+    return CLOCK() - begun_ns

@@ -21,11 +21,11 @@ import msgspec
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import write_whole
 from eqrt.training.dataset.pieces import Counts
 from eqrt.training.dataset.shards import remove_unfinished
 from eqrt.training.dataset.split import Split
 from eqrt.training.dataset.windows import WindowOptions
-from eqrt.training.files import write_whole
 from eqrt.training.recordings.recording import Part, Source
 
 SCHEMA = 1

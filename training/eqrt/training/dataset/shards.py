@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.errors import EqrtError
+from eqrt.core.files import PART, write_whole
 from eqrt.training.dataset.windows import COLUMNS, TENSORS, Windows, no_windows
-from eqrt.training.files import UNFINISHED, write_whole
 
 Records = NDArray[np.void]
 Layout = np.dtype[np.void]
@@ -41,6 +41,7 @@ PROVENANCE = tuple(name for name in COLUMNS if name not in TENSORS)
 _WINDOWS_FILE = "windows.npy"
 _PROVENANCE_FILE = "provenance.npy"
 _RECORDINGS_FILE = "recordings.json"
+_UNFINISHED = ".unfinished-"  # how the names of shards that are not whole begin
 
 
 def layout(contract: ModelContract, columns: Sequence[str]) -> Layout:
@@ -126,7 +127,7 @@ class ShardWriter:
 
     def __init__(self, folder: Path, number: int, contract: ModelContract) -> None:
         self._final = shard_folder(folder, number)
-        self._folder = folder / f"{UNFINISHED}{self._final.name}-{uuid.uuid4().hex}"
+        self._folder = folder / f"{_UNFINISHED}{self._final.name}-{uuid.uuid4().hex}"
         self._contract = contract
         self._recordings: list[RecordedIn] = []
         self._skipped: list[str] = []
@@ -187,7 +188,7 @@ class ShardWriter:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove what a run that was cut short left half-written."""
-    for path in folder.glob(f"{UNFINISHED}*"):
+    for path in [*folder.glob(f"{_UNFINISHED}*"), *folder.glob(f".*{PART}")]:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
