@@ -95,7 +95,8 @@ def _with_whole_id(piece: str, tokens: list[str]) -> str:
     number = "".join(tokens[_ID_AT.get(tokens[0], 0) :][:1])
     if not _MAX_STANDARD_ID < _whole(number) <= _MAX_EXTENDED_ID:
         return piece
-    return re.sub(rf"\b{number}\b", str(_whole(number) | _IS_EXTENDED), piece, count=1)
+    as_written = rf"(?<!\w){re.escape(number)}\b"  # it may have a sign
+    return re.sub(as_written, str(_whole(number) | _IS_EXTENDED), piece, count=1)
 
 
 def _check_sizes(tokens: list[str], where: str) -> None:
