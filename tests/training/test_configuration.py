@@ -35,6 +35,7 @@ def test_every_configuration_that_ships_is_read_and_comes_back(path: Path) -> No
         (('name = "tiny"', "name = 3"), "name is 3, expected a text"),
         (("[data]", "[date]"), "top level has missing or unknown fields: data, date"),
         (("batch_size = 16", "batch_size = 0"), r"\[train\].*>= 1.*batch_size"),
+        (("batch_size = 16", "batch_size = 800000000000"), r"\[train\].*<= 65536.*batch_size"),
         (("batch_size = 16", 'batch_size = "16"'), r"\[train\].*Expected `int`.*batch_size"),
         (('optimizer = "adamw"', 'optimizer = "sgd"'), r"\[train\].*'sgd'.*optimizer"),
         (('loss = "best_mode"', 'loss = "worst"'), r"\[train\].*'worst', expected one of ade"),
@@ -48,6 +49,7 @@ def test_every_configuration_that_ships_is_read_and_comes_back(path: Path) -> No
         (("max_grad_norm = 1.0", "max_grad_norm = inf"), r"\[train\]: max_grad_norm is inf, exp"),
         (("heads = 2", "heads = 7"), r"\[network\]: width is 16, expected a multiple of heads, 7"),
         (("width = 16", "width = -3"), r"\[network\].*>= 1.*width"),
+        (("width = 16", "width = 1000000"), r"\[network\].*<= 65536.*width"),
         (("width = 16", 'width = "x"'), r"\[network\].*Expected `int`.*width"),
         (("dropout = 0.1", "dropout = 1.5"), r"\[network\].*< 1.0.*dropout"),
         (("layers = 1", "layers = 0"), r"\[network\].*>= 1.*layers"),
@@ -99,6 +101,12 @@ def test_the_papers_networks_are_checked_likewise(
 def test_a_missing_configuration_is_a_usage_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such configuration"):
         load_config(tmp_path / "missing.toml")
+
+
+def test_a_mark_that_some_editors_begin_with_is_no_error(tmp_path: Path) -> None:
+    path = tiny_file(tmp_path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert load_config(path) == tiny()
 
 
 def test_the_ade_of_one_mode_does_not_train_several(tmp_path: Path) -> None:

@@ -461,7 +461,14 @@ def test_a_folder_with_something_in_it_is_left_alone(
 
 
 @pytest.mark.parametrize(
-    "option", [["--minutes", "0"], ["--jobs", "0"], ["--scale", "nan"], ["--seconds", "soon"]]
+    "option",
+    [
+        ["--minutes", "0"],
+        ["--minutes", "1e300"],
+        ["--jobs", "0"],
+        ["--scale", "nan"],
+        ["--seconds", "soon"],
+    ],
 )
 def test_a_wrong_option_is_a_usage_error(
     town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: list[str]

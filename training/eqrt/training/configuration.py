@@ -21,7 +21,15 @@ from eqrt.training.augment import AugmentConfig
 from eqrt.training.dataset.windows import WindowOptions
 from eqrt.training.losses import LOSSES
 from eqrt.training.networks.registry import ModelConfig
-from eqrt.training.tables import Count, NotNegative, PartialShare, Positive, check_names, fill
+from eqrt.training.tables import (
+    Count,
+    NotNegative,
+    PartialShare,
+    Positive,
+    Width,
+    check_names,
+    fill,
+)
 
 Tables = dict[str, Any]
 
@@ -63,7 +71,7 @@ class LoopConfig:
 
     steps: Count | None = None
     epochs: Positive | None = None
-    batch_size: Count
+    batch_size: Width
     """Windows per step, those of all processes together."""
     optimizer: Literal["adam", "adamw", "muon"]
     learning_rate: Positive
@@ -154,7 +162,7 @@ _NEEDED = {"name", "scene", "network", "data", "train"}
 def load_config(path: Path) -> TrainConfig:
     """Read a configuration; EqrtError names the file and the first field that is wrong."""
     try:
-        return TrainConfig.from_tables(tomllib.loads(path.read_text(encoding="utf-8")))
+        return TrainConfig.from_tables(tomllib.loads(path.read_text(encoding="utf-8-sig")))
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such configuration; see training/configs") from error
     except OSError as error:

@@ -16,23 +16,23 @@ from eqrt.training.networks.config import UNIT_M, SceneConfig
 from eqrt.training.networks.layers import mlp
 from eqrt.training.networks.modes import most_probable_first
 from eqrt.training.networks.raster import Pixels, RasterEncoder
-from eqrt.training.tables import Count, Positive
+from eqrt.training.tables import Positive, Width
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LstmConfig:
     """Table [network] with kind = "lstm"."""
 
-    hidden: Count
+    hidden: Width
     """Width of the LSTM, of the features and of the perceptrons."""
-    mlp_layers: Count
+    mlp_layers: Width
     """Layers of every perceptron."""
     image_pixels: Pixels
     """Of one side of the drawn map, a multiple of 4."""
     image_cell_m: Positive
-    image_channels: Count
+    image_channels: Width
     """Of both convolutions."""
-    image_width: Count
+    image_width: Width
     """First layer of the perceptron that reads the image."""
 
 

@@ -33,6 +33,8 @@ from eqrt.training.simulation.scenario import Scenario, read_scenario
 from eqrt.training.simulation.sensor import SENSORS
 from eqrt.training.simulation.traffic import Demand
 
+MAX_MINUTES = 1e6
+"""Two years of traffic: more is a slip of the pen."""
 RECORDINGS_PER_RUN = 4 * OBSERVERS
 """More runs differ more; fewer spend less time on filling the network."""
 
@@ -66,7 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_amount_arguments(parser: argparse.ArgumentParser) -> None:
     amount = parser.add_mutually_exclusive_group()
-    amount.add_argument("--minutes", type=_above(0.0), metavar="M", help="recorded, in total")
+    amount.add_argument(
+        "--minutes", type=_above(0.0, MAX_MINUTES), metavar="M", help="recorded, in total"
+    )
     amount.add_argument(
         "--recordings", type=_count_of(1), metavar="N", help="in total (default 40)"
     )
@@ -251,11 +255,13 @@ def _summary(tally: Tally, asked: int, args: argparse.Namespace, seconds: float)
     )
 
 
-def _above(bound: float) -> Callable[[str], float]:
+def _above(bound: float, most: float = math.inf) -> Callable[[str], float]:
     def number(text: str) -> float:
         value = _from(bound)(text)
         if value == bound:
             raise argparse.ArgumentTypeError(f"{text} is not above {bound:g}")
+        if value > most:
+            raise argparse.ArgumentTypeError(f"{text} is above {most:g}")
         return value
 
     return number
