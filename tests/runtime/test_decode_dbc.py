@@ -179,8 +179,8 @@ SG_MUL_VAL_ {id} NESTED OTHER 3-5;
 
 def test_an_id_of_29_bits_is_one_without_the_bit_that_says_so(tmp_path: Path) -> None:
     """As in DBCs of opendbc; everything else that speaks of the message finds it as well."""
-    named = {"right.dbc": 0x12DD54A7 | 1 << 31, "without.dbc": 0x12DD54A7}
-    named |= {"signed.dbc": "+316495015"}
+    named: dict[str, int | str] = {"right.dbc": 0x12DD54A7 | 1 << 31, "without.dbc": 0x12DD54A7}
+    named["signed.dbc"] = "+316495015"
     for name, number in named.items():
         (tmp_path / name).write_text(LONG_ID.format(id=number))
     right, without, signed = (load_dbc(tmp_path / name).messages for name in named)
