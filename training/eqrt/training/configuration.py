@@ -26,6 +26,7 @@ from eqrt.training.tables import (
     NotNegative,
     PartialShare,
     Positive,
+    Share,
     Width,
     check_names,
     fill,
@@ -89,6 +90,8 @@ class LoopConfig:
     """Steps; as often, checkpoint and state are written."""
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     precision: Literal["float32", "bf16"] = "float32"
+    teacher_share: Share = 0.0
+    """Of the windows, how many have for their future what the teachers expect (`teachers`)."""
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.epochs is None):
@@ -130,6 +133,11 @@ class TrainConfig:
             if "augment" in tables
             else None,
         )
+        if config.train.teacher_share and getattr(config.model.network, "uncertainty", False):
+            raise ValueError(
+                "[train] teacher_share and [network] uncertainty do not go together: what teachers "
+                "expect scatters less than what happens, so covariances would come out too small"
+            )
         modes = config.model.scene.num_modes
         if config.train.loss == "ade" and modes > 1:
             raise ValueError(f"[train] loss 'ade' trains one mode, [scene] has {modes}; best_mode?")
