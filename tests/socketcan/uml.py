@@ -8,6 +8,7 @@ of its own, so any number may run side by side. A boot and its end take about tw
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -24,12 +25,14 @@ DRIVERS = (
     "net/sched/sch_netem",  # makes a bus as slow as real ones
 )
 MEMORY_MB = 768
+WIDE_REGISTERS = Path(__file__).with_name("wide_registers.c")
 BOOT_TIMEOUT_S = 60.0  # a boot takes 1.7 s; a machine that is busy with other tests takes longer
 
 
 def missing() -> str | None:
     """The first thing that a boot needs and this machine lacks."""
-    needed = (KERNEL, "insmod", "ip", "timeout")
+    needed = [KERNEL, "insmod", "ip", "timeout"]
+    needed += ["cc"] if _has_wide_registers() else []
     return next((name for name in needed if shutil.which(name, path=_path()) is None), None)
 
 
@@ -84,7 +87,7 @@ def _boot(init: Path, timeout_s: float) -> str:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            env={"PATH": _path(), "TMPDIR": _memory_folder(init.parent)},
+            env={"PATH": _path(), "TMPDIR": _memory_folder(init.parent)} | _preloaded(init.parent),
             start_new_session=True,
         )
         try:
@@ -93,6 +96,22 @@ def _boot(init: Path, timeout_s: float) -> str:
             os.killpg(kernel.pid, signal.SIGKILL)
             kernel.wait()
     return console.read_text(errors="replace")
+
+
+def _has_wide_registers() -> bool:
+    """Whether this processor has registers that the kernel does not know (`WIDE_REGISTERS`)."""
+    flags = re.search(r"^flags\s*:.*", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    return flags is not None and "amx_tile" in flags[0].split()
+
+
+def _preloaded(machine: Path) -> dict[str, str]:
+    """What makes the kernel run on such a processor, as variables for it; elsewhere nothing."""
+    if not _has_wide_registers():
+        return {}
+    library = machine / "wide_registers.so"
+    build = ["cc", "-O2", "-shared", "-fPIC", "-o", str(library), str(WIDE_REGISTERS)]
+    subprocess.run(build, check=True, env={"PATH": _path()})
+    return {"LD_PRELOAD": str(library)}
 
 
 def _memory_folder(otherwise: Path) -> str:

@@ -35,7 +35,7 @@ def find_launcher() -> Launcher:
     if missing := uml.missing():
         raise NoCanKernelError(
             f"no vcan in this kernel, and no User-Mode Linux either: {missing} not found; "
-            "install the packages user-mode-linux, kmod and iproute2"
+            "install the packages user-mode-linux, kmod, iproute2, and gcc if the processor has AMX"
         )
     return uml.run_in_uml
 
