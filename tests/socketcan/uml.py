@@ -38,10 +38,19 @@ def missing() -> str | None:
 
 def run_in_uml(command: Sequence[str], work: Path, timeout_s: float) -> Completed:
     """Boot, run `command` in the folder `work`, halt; RuntimeError if the guest did not come up."""
-    machine = work / "uml"
+    return boot(_init(command, work, timeout_s), work, timeout_s)
+
+
+def boot(script: str, work: Path, timeout_s: float) -> Completed:
+    """Boot with a shell script as the first process, until the guest powers off.
+
+    The script sees that a program writes what it says, and its exit status, into `stdout`, `stderr`
+    and `status` of the folder `machine_folder(work)`. RuntimeError if there is no status.
+    """
+    machine = machine_folder(work)
     machine.mkdir()
     init = machine / "init"
-    init.write_text(_init(command, work, machine, timeout_s), encoding="utf-8")
+    init.write_text(script, encoding="utf-8")
     init.chmod(0o755)
     console = _boot(init, timeout_s + BOOT_TIMEOUT_S)
     status, stdout, stderr = (machine / name for name in ("status", "stdout", "stderr"))
@@ -50,13 +59,27 @@ def run_in_uml(command: Sequence[str], work: Path, timeout_s: float) -> Complete
     return Completed(int(status.read_text()), stdout.read_text(), stderr.read_text())
 
 
-def _init(command: Sequence[str], work: Path, machine: Path, timeout_s: float) -> str:
+def machine_folder(work: Path) -> Path:
+    """Where the machine that works in `work` keeps what is its own."""
+    return work / "uml"
+
+
+def insert(drivers: Sequence[str]) -> str:
+    """Shell lines that load modules of the kernel."""
+    return "\n".join(f'insmod "{MODULES}/$(uname -r)/kernel/{name}.ko"' for name in drivers)
+
+
+def exports(work: Path) -> str:
+    """Shell lines that set what a program finds in its environment."""
+    return "\n".join(f"export {k}={shlex.quote(v)}" for k, v in environment(work).items())
+
+
+def _init(command: Sequence[str], work: Path, timeout_s: float) -> str:
     """The guest's first process: a shell script that powers the guest off, however it ends."""
-    exports = "\n".join(f"export {k}={shlex.quote(v)}" for k, v in environment(work).items())
-    drivers = "\n".join(f'insmod "{MODULES}/$(uname -r)/kernel/{name}.ko"' for name in DRIVERS)
+    machine = machine_folder(work)
     return f"""#!/bin/sh -e
 trap 'sync; echo o > /proc/sysrq-trigger; sleep 60' EXIT
-{exports}
+{exports(work)}
 mount -t proc proc /proc
 mount -t sysfs sysfs /sys
 mkdir -p /dev/shm
@@ -64,7 +87,7 @@ mount -t tmpfs tmpfs /dev/shm
 # On a busy machine the guest stands still for seconds: no message may be lost meanwhile.
 echo 8388608 > /proc/sys/net/core/rmem_default
 mount -t hostfs -o {shlex.quote(str(work))} none {shlex.quote(str(work))}
-{drivers}
+{insert(DRIVERS)}
 {SETUP}
 cd {shlex.quote(str(work))}
 status=0

@@ -12,15 +12,13 @@ import sys
 import time
 from pathlib import Path
 
-import can
-
 import restricted
+from predicted_cycles import predicted_cycles
 
 EQRT = [sys.executable, "-m", "eqrt"]
 RESTRICTED = [sys.executable, restricted.__file__, *EQRT]  # with the sockets of the unit
 CHANNEL = "vcan5"
 SERVE = [*RESTRICTED, "serve", "--can", CHANNEL, "--profile", "ars408", "--wait-for-bus"]
-STATUS, MODE_BYTE, NUM_OBJECTS_BYTE, SILENT = 0x6E0, 3, 5, 6  # of eqrt.dbc
 PATIENCE_S = 30.0
 
 
@@ -38,16 +36,7 @@ def wait_for(errors: Path, words: str, times: int) -> None:
 
 def predictions(log: str) -> int:
     """How many cycles the service predicts while the log is played."""
-    filters: list[can.typechecking.CanFilter] = [{"can_id": STATUS, "can_mask": 0x7FF}]
-    with can.Bus(CHANNEL, "socketcan", fd=True, can_filters=filters) as bus:
-        subprocess.run([*EQRT, "play", log, "--can", CHANNEL], check=True, capture_output=True)
-        is_silent, told = False, 0
-        while not is_silent:
-            message = bus.recv(PATIENCE_S)
-            assert message is not None
-            is_silent = told > 0 and message.data[MODE_BYTE] == SILENT
-            told += message.data[NUM_OBJECTS_BYTE] > 0
-        return told
+    return predicted_cycles(log, CHANNEL, EQRT)
 
 
 def main(log: str) -> dict[str, object]:

@@ -44,12 +44,17 @@ class Realtime:
     def _cpus(self) -> str | None:
         if self.cpus is None:
             return None
+        wanted, usable = (
+            ",".join(map(str, cpus)) for cpus in (self.cpus, sorted(os.sched_getaffinity(0)))
+        )
         try:
             os.sched_setaffinity(0, self.cpus)
-        except (OSError, ValueError, OverflowError):
-            wanted, usable = (
-                ",".join(map(str, cpus)) for cpus in (self.cpus, sorted(os.sched_getaffinity(0)))
+        except PermissionError as error:
+            return (
+                f"cpus {wanted}: refused ({error.strerror}); give SystemCallFilter=@resources in "
+                "the unit"
             )
+        except (OSError, ValueError, OverflowError):
             return f"cpus {wanted}: not to be had; this process may use {usable}"
         return None
 
