@@ -172,7 +172,11 @@ def test_the_command_says_who_teaches_and_the_card_how_it_was_called(
 @pytest.mark.parametrize(
     ("share", "option", "said"),
     [
-        ("", ["--teacher"], "teacher_share is 0, so --teacher would teach nothing; say how much"),
+        (
+            "",
+            ["--teacher"],
+            "teacher_share is 0, so --teacher would teach nothing; give --teacher-share 0.5",
+        ),
         ("teacher_share = 0.5", [], "teacher_share is 0.5, but nobody teaches; give --teacher"),
     ],
 )

@@ -25,7 +25,7 @@ from torch.optim import Optimizer
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.training.augment import Batch
 from eqrt.training.claim import claimed
-from eqrt.training.configuration import LoopConfig, TrainConfig, load_config
+from eqrt.training.configuration import MAX_SEED, LoopConfig, TrainConfig, load_config
 from eqrt.training.dataset.store import license_notice
 from eqrt.training.evaluate import INPUTS
 from eqrt.training.loader import BatchMaker, Loader
@@ -71,13 +71,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CHECKPOINT",
-        help="learn also from what this network expects, see [train] teacher_share; may be given "
-        "several times",
+        help="learn also from what this network expects; may be given several times",
+    )
+    parser.add_argument(
+        "--teacher-share",
+        type=float,
+        metavar="SHARE",
+        help="of the windows that teachers speak of, instead of the configuration's (0 to 1)",
     )
     parser.add_argument(
         "--resume", action="store_true", help="go on from the state in --out, if there is one"
     )
     parser.add_argument("--steps", type=int, help="instead of the configuration's")
+    parser.add_argument("--seed", type=int, help="instead of the configuration's")
     parser.add_argument(
         "--train-share",
         type=float,
@@ -257,7 +263,22 @@ def _config(args: argparse.Namespace) -> TrainConfig:
         if not 0.0 < args.train_share <= 1.0:
             raise UsageError(f"--train-share is {args.train_share}, expected above 0 to 1")
         config = config.with_train_share(args.train_share)
+    if args.seed is not None:
+        if not 0 <= args.seed <= MAX_SEED:
+            raise UsageError(f"--seed is {args.seed}, expected 0 to {MAX_SEED}")
+        config = config.with_seed(args.seed)
+    if args.teacher_share is not None:
+        config = _with_teacher_share(config, args.teacher_share)
     return config.with_steps(args.steps) if args.steps else config
+
+
+def _with_teacher_share(config: TrainConfig, share: float) -> TrainConfig:
+    if not 0.0 <= share <= 1.0:
+        raise UsageError(f"--teacher-share is {share}, expected 0 to 1")
+    try:
+        return config.with_teacher_share(share)
+    except ValueError as error:
+        raise UsageError(f"--teacher-share {share:g}: {error}") from error
 
 
 def _origins(args: argparse.Namespace, config: TrainConfig) -> Origins:
@@ -265,7 +286,8 @@ def _origins(args: argparse.Namespace, config: TrainConfig) -> Origins:
     if bool(args.teachers) != (config.train.teacher_share > 0):
         share = f"[train] teacher_share is {config.train.teacher_share:g}"
         raise UsageError(
-            f"{args.config}: {share}, so --teacher would teach nothing; say how much, such as 0.5"
+            f"{args.config}: {share}, so --teacher would teach nothing; give --teacher-share 0.5, "
+            "or as much as you like"
             if args.teachers
             else f"{args.config}: {share}, but nobody teaches; give --teacher CHECKPOINT"
         )
@@ -313,7 +335,9 @@ def _command(args: argparse.Namespace, resume: bool = False) -> str:
     words += [] if args.start is None else ["--from", args.start]
     words += [word for path in args.teachers for word in ("--teacher", path)]
     words += ["--steps", args.steps] if args.steps else []
-    words += [] if args.train_share is None else ["--train-share", args.train_share]
+    for option in ("seed", "train_share", "teacher_share"):
+        value = getattr(args, option)
+        words += [] if value is None else [f"--{option.replace('_', '-')}", value]
     for option in ("threads", "loader_threads"):
         words += [f"--{option.replace('_', '-')}", getattr(args, option)]
     words += ["--device", args.device]
