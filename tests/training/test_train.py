@@ -229,20 +229,29 @@ def test_held_out_recordings_that_are_not_there_are_named(
 
 def test_a_share_of_the_recordings_is_asked_for_on_the_command_line(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert main(command(tiny_file(tmp_path), out, "--steps", "1", "--train-share", "0.9")) == 0
+    options = ["--steps", "1", "--seed", "7", "--train-share", "0.9"]
+    assert main(command(tiny_file(tmp_path), out, *options)) == 0
     card = load_checkpoint(out / MODEL_FILE).card
-    assert "--train-share 0.9" in card.command
-    assert card.config_sha256 == tiny().with_steps(1).with_train_share(0.9).sha256
+    assert "--seed 7 --train-share 0.9" in card.command
+    assert card.config_sha256 == tiny().with_steps(1).with_seed(7).with_train_share(0.9).sha256
+    assert card.seed == 7
     assert card.recordings == 1
     assert card.samples == tiny().train.batch_size
 
 
-def test_a_share_that_is_none_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--train-share", "1.5", "--train-share is 1.5, expected above 0 to 1"),
+        ("--seed", "-1", "--seed is -1, expected 0 to 9223372036854775807"),
+    ],
+)
+def test_a_share_or_seed_that_is_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, value: str, said: str
 ) -> None:
-    words = command(tiny_file(tmp_path), tmp_path / "out", "--train-share", "1.5")
+    words = command(tiny_file(tmp_path), tmp_path / "out", option, value)
     assert main(words) == 2
-    assert "--train-share is 1.5, expected above 0 to 1" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--steps", "--threads", "--loader-threads"])

@@ -26,7 +26,6 @@ from eqrt.training.tables import (
     NotNegative,
     PartialShare,
     Positive,
-    Share,
     Width,
     check_names,
     fill,
@@ -91,8 +90,6 @@ class LoopConfig:
     """Steps; as often, checkpoint and state are written."""
     seed: Annotated[int, msgspec.Meta(ge=0, le=MAX_SEED)]
     precision: Literal["float32", "bf16"] = "float32"
-    teacher_share: Share = 0.0
-    """Of the windows, how many have for their future what the teachers expect (`teachers`)."""
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.epochs is None):
@@ -119,23 +116,13 @@ class TrainConfig:
     augment: AugmentConfig | None
     """None = windows as they were recorded."""
 
-    def __post_init__(self) -> None:
-        if self.train.teacher_share and getattr(self.model.network, "uncertainty", False):
-            raise ValueError(
-                "[train] teacher_share and [network] uncertainty do not go together: what teachers "
-                "expect scatters less than what happens, so covariances would come out too small"
-            )
-        modes = self.model.scene.num_modes
-        if self.train.loss == "ade" and modes > 1:
-            raise ValueError(f"[train] loss 'ade' trains one mode, [scene] has {modes}; best_mode?")
-
     @classmethod
     def from_tables(cls, tables: Tables) -> TrainConfig:
         """Raises ValueError that names the table and what is missing, unknown or wrong in it."""
         check_names("top level", set(tables), _NEEDED, _NEEDED | {"augment"})
         if not isinstance(tables["name"], str):
             raise ValueError(f"name is {tables['name']!r}, expected a text")
-        return cls(
+        config = cls(
             name=tables["name"],
             model=ModelConfig.from_tables(tables["scene"], tables["network"]),
             data=fill(DataConfig, tables["data"], "data"),
@@ -144,6 +131,10 @@ class TrainConfig:
             if "augment" in tables
             else None,
         )
+        modes = config.model.scene.num_modes
+        if config.train.loss == "ade" and modes > 1:
+            raise ValueError(f"[train] loss 'ade' trains one mode, [scene] has {modes}; best_mode?")
+        return config
 
     def to_tables(self) -> Tables:
         """What `from_tables` reads."""
@@ -164,10 +155,6 @@ class TrainConfig:
     def with_seed(self, seed: int) -> TrainConfig:
         """The same for other random numbers."""
         return replace(self, train=replace(self.train, seed=seed))
-
-    def with_teacher_share(self, share: float) -> TrainConfig:
-        """The same for more or fewer windows that teachers speak of. Raises as `from_tables`."""
-        return replace(self, train=replace(self.train, teacher_share=share))
 
     def with_train_share(self, share: float) -> TrainConfig:
         """The same on another share of the recordings."""

@@ -13,10 +13,10 @@ from eqrt.training.configuration import TrainConfig
 from eqrt.training.evaluate import evaluate, evaluate_constant_velocity
 from eqrt.training.loader import LoaderTimes
 from eqrt.training.meter import LossMeter, Stopwatch
-from eqrt.training.origins import Origins
 from eqrt.training.plots import plot_metrics
 from eqrt.training.progress import Display, MetricsLog
 from eqrt.training.ranks import Ranks
+from eqrt.training.start import Start, credited
 from eqrt.training.state import TrainingState, save_state
 from eqrt.training.training_data import TrainingData
 
@@ -34,11 +34,13 @@ class Goal:
     out: Path
     command: str
     """As typed, for the model card."""
-    origins: Origins
+    start: Start | None = None
+    """None = random weights."""
 
     def fingerprint(self) -> dict[str, int]:
         """Tells trainings of one configuration apart by what went in."""
-        return self.data.pool.fingerprint() | self.origins.fingerprint()
+        start = {} if self.start is None else self.start.fingerprint()
+        return self.data.pool.fingerprint() | start
 
 
 class Recorder:
@@ -130,7 +132,8 @@ class Recorder:
 
     def _card(self, metrics: dict[str, float]) -> Card:
         config, data = self._goal.config, self._goal.data
-        source = self._goal.origins.credited(data.source)
+        source = credited(data.source, self._goal.start)
+        before = () if self._goal.start is None else self._goal.start.trained_on
         return Card(
             name=config.name,
             data=source.credits,
@@ -145,7 +148,7 @@ class Recorder:
             seed=config.train.seed,
             recordings=data.recordings,
             samples=self._state.step * config.train.batch_size,
-            trained_on=self._goal.origins.trained_on(data.trained_on),
+            trained_on=tuple(sorted({*data.trained_on, *before})),
         )
 
 

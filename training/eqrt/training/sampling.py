@@ -20,7 +20,7 @@ from eqrt.training.dataset.windows import Windows
 
 Rows = NDArray[np.intp]
 
-ORDER, NOISE, DROPOUT, TEACHING = range(4)
+ORDER, NOISE, DROPOUT = range(3)
 """What a derived seed is for: the first of its numbers, so that no two uses share one."""
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing, nullcontext
 from pathlib import Path
 
@@ -30,14 +30,13 @@ from eqrt.training.dataset.store import license_notice
 from eqrt.training.evaluate import INPUTS
 from eqrt.training.loader import BatchMaker, Loader
 from eqrt.training.losses import LOSSES, whole_loss
-from eqrt.training.origins import Origins, open_origin
 from eqrt.training.progress import Display, Lines, Silence, new_display
 from eqrt.training.ranks import Ranks, alone, join_ranks
 from eqrt.training.recorder import MODEL_FILE, STATE_FILE, Goal, Recorder
-from eqrt.training.sampling import DROPOUT, TEACHING, Sampler, derived_seed
+from eqrt.training.sampling import DROPOUT, Sampler, derived_seed
+from eqrt.training.start import Start, credited, open_start
 from eqrt.training.state import TrainingState, load_state, new_state, update_average
 from eqrt.training.stopping import StopRequest
-from eqrt.training.teachers import taught
 from eqrt.training.training_data import TrainingData, open_training_data
 
 REPORT_EVERY = 50
@@ -63,21 +62,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="start",
         metavar="CHECKPOINT",
         help="begin with the weights of this checkpoint, instead of random ones",
-    )
-    parser.add_argument(
-        "--teacher",
-        type=Path,
-        dest="teachers",
-        action="append",
-        default=[],
-        metavar="CHECKPOINT",
-        help="learn also from what this network expects; may be given several times",
-    )
-    parser.add_argument(
-        "--teacher-share",
-        type=float,
-        metavar="SHARE",
-        help="of the windows that teachers speak of, instead of the configuration's (0 to 1)",
     )
     parser.add_argument(
         "--resume", action="store_true", help="go on from the state in --out, if there is one"
@@ -106,16 +90,16 @@ def run(args: argparse.Namespace) -> int:
     with join_ranks(args.device) as ranks, claimed(args.out) if ranks.leads else nullcontext():
         _check_out(args.out, args.resume)
         data = open_training_data(config, args.data)
-        origins = _origins(args, config)
+        start = None if args.start is None else open_start(args.start, config)
         steps = config.train.total_steps(data.pool.samples_per_epoch)
         shown = new_display(steps) if ranks.leads else Silence()
         with shown as display, StopRequest() as stop:
-            _introduce(config, data, origins, ranks, display)
+            _introduce(config, data, start, ranks, display)
             state = train(
                 config,
                 data,
                 args.out,
-                origins=origins,
+                start=start,
                 ranks=ranks,
                 resume=args.resume,
                 loader_threads=args.loader_threads,
@@ -136,7 +120,7 @@ def train(
     data: TrainingData,
     out: Path,
     *,
-    origins: Origins | None = None,
+    start: Start | None = None,
     ranks: Ranks | None = None,
     resume: bool = False,
     loader_threads: int = 1,
@@ -146,33 +130,30 @@ def train(
 ) -> TrainingState:
     """The loop. `out` receives the checkpoint, the state, the metrics and their plots.
 
-    It begins with random weights, where `origins` do not say otherwise. The state returned has done
-    all its steps, or fewer if `should_stop` said so. With `resume`, the training goes on from the
-    state in `out` if there is one. Raises EqrtError if that state is of another training, or if the
-    loss is no longer a number.
+    It begins with the weights of `start`, or with random ones. The state returned has done all its
+    steps, or fewer if `should_stop` said so. With `resume`, the training goes on from the state in
+    `out` if there is one. Raises EqrtError if that state is of another training, or if the loss is
+    no longer a number.
     """
     loop, ranks, display = config.train, ranks or alone(), display or Lines()
-    origins = origins or Origins()
     make = batch_maker(config, data, ranks)
     steps = loop.total_steps(data.pool.samples_per_epoch)
     state = new_state(config, ranks.device)
-    goal = Goal(config, data, out, command, origins)
+    goal = Goal(config, data, out, command, start)
     if resume and (out / STATE_FILE).exists():
         load_state(out / STATE_FILE, state, config, goal.fingerprint())
         display.line(f"resumed             after step {state.step} of {steps}")
-    else:
-        origins.begin(state)
+    elif start is not None:
+        start.begin(state)
     model = ranks.parallel(state.network)
-    teachers = [origin.network.to(ranks.device) for origin in origins.teachers]
     with (
         closing(Recorder(goal, state, ranks=ranks, display=display)) as recorder,
         Loader(make, state.step, steps, loader_threads, ranks.device) as loader,
     ):
         for batch in loader:
             set_learning_rate(state.optimizer, learning_rate(loop, state.step, steps))
-            lesson = _lesson(batch, teachers, loop, state.step, ranks.rank)
             torch.manual_seed(derived_seed(DROPOUT, loop.seed, state.step, ranks.rank))
-            recorder.add(*train_step(model, state.optimizer, lesson, loop))
+            recorder.add(*train_step(model, state.optimizer, batch, loop))
             update_average(state.average, state.network, loop.average_decay)
             state.step += 1
             stopping = ranks.any(should_stop())
@@ -186,16 +167,6 @@ def train(
         recorder.plot()
         recorder.summarize(loader.times, loader_threads)
     return state
-
-
-def _lesson(
-    batch: Batch, teachers: Sequence[nn.Module], config: LoopConfig, step: int, rank: int
-) -> Batch:
-    """The batch of a step, with what the teachers expect in it, if there are any."""
-    if not teachers:
-        return batch
-    torch.manual_seed(derived_seed(TEACHING, config.seed, step, rank))
-    return taught(batch, teachers, config.teacher_share)
 
 
 def train_step(
@@ -267,34 +238,7 @@ def _config(args: argparse.Namespace) -> TrainConfig:
         if not 0 <= args.seed <= MAX_SEED:
             raise UsageError(f"--seed is {args.seed}, expected 0 to {MAX_SEED}")
         config = config.with_seed(args.seed)
-    if args.teacher_share is not None:
-        config = _with_teacher_share(config, args.teacher_share)
     return config.with_steps(args.steps) if args.steps else config
-
-
-def _with_teacher_share(config: TrainConfig, share: float) -> TrainConfig:
-    if not 0.0 <= share <= 1.0:
-        raise UsageError(f"--teacher-share is {share}, expected 0 to 1")
-    try:
-        return config.with_teacher_share(share)
-    except ValueError as error:
-        raise UsageError(f"--teacher-share {share:g}: {error}") from error
-
-
-def _origins(args: argparse.Namespace, config: TrainConfig) -> Origins:
-    """The checkpoints of `--from` and `--teacher`; EqrtError if they do not go with `config`."""
-    if bool(args.teachers) != (config.train.teacher_share > 0):
-        share = f"[train] teacher_share is {config.train.teacher_share:g}"
-        raise UsageError(
-            f"{args.config}: {share}, so --teacher would teach nothing; give --teacher-share 0.5, "
-            "or as much as you like"
-            if args.teachers
-            else f"{args.config}: {share}, but nobody teaches; give --teacher CHECKPOINT"
-        )
-    return Origins(
-        None if args.start is None else open_origin(args.start, config),
-        tuple(open_origin(path, config) for path in args.teachers),
-    )
 
 
 def _check_out(out: Path, resume: bool) -> None:
@@ -311,16 +255,14 @@ def _check_out(out: Path, resume: bool) -> None:
 
 
 def _introduce(
-    config: TrainConfig, data: TrainingData, origins: Origins, ranks: Ranks, display: Display
+    config: TrainConfig, data: TrainingData, start: Start | None, ranks: Ranks, display: Display
 ) -> None:
     """What is trained, on what, from what, and whether one may sell the result."""
     display.line(f"training windows    {len(data.pool)}, {data.pool.samples_per_epoch} an epoch")
     display.line(f"held-out targets    {len(data.held_out)}")
-    if origins.start is not None:
-        display.line(f"begins with         {origins.start.path}")
-    for teacher in origins.teachers:
-        display.line(f"learns from         {teacher.path}")
-    source = origins.credited(data.source)
+    if start is not None:
+        display.line(f"begins with         {start.path}")
+    source = credited(data.source, start)
     display.line(license_notice(source) or f"data licence        {source.license}")
     if ranks.world > 1:
         share = config.train.batch_size // ranks.world
@@ -333,9 +275,8 @@ def _command(args: argparse.Namespace, resume: bool = False) -> str:
     words += [word for path in args.data for word in ("--data", path)]
     words += ["--out", args.out]
     words += [] if args.start is None else ["--from", args.start]
-    words += [word for path in args.teachers for word in ("--teacher", path)]
     words += ["--steps", args.steps] if args.steps else []
-    for option in ("seed", "train_share", "teacher_share"):
+    for option in ("seed", "train_share"):
         value = getattr(args, option)
         words += [] if value is None else [f"--{option.replace('_', '-')}", value]
     for option in ("threads", "loader_threads"):

@@ -11,7 +11,7 @@ from eqrt.cli import main
 from eqrt.core.errors import EqrtError
 from eqrt.training.checkpoint import load_checkpoint, read_tensors
 from eqrt.training.dataset.split import group_digest
-from eqrt.training.origins import Origins, open_origin
+from eqrt.training.start import open_start
 from eqrt.training.train import train
 from tiny_training import DATA, tiny, tiny_data, tiny_file
 from window_samples import packed_scenes
@@ -33,7 +33,7 @@ def test_it_begins_with_these_weights_and_not_with_random_ones(
 ) -> None:
     """A step that moves them by less than a float can tell, with another seed."""
     config = tiny({"train": HARDLY, "network": {"dropout": 0.0}})
-    state = train(config, tiny_data(), tmp_path, origins=Origins(open_origin(trained, config)))
+    state = train(config, tiny_data(), tmp_path, start=open_start(trained, config))
     before, _ = read_tensors(trained)
     for name, weight in state.network.state_dict().items():
         torch.testing.assert_close(weight, before[name], atol=1e-9, rtol=1e-6)
@@ -74,22 +74,20 @@ def test_the_licence_of_the_data_behind_the_start_counts_too(
 def test_going_on_without_the_start_that_it_had_is_refused(trained: Path, tmp_path: Path) -> None:
     """Else its licence would be forgotten."""
     config = tiny().with_steps(2)
-    train(config, tiny_data(), tmp_path, origins=Origins(open_origin(trained, config)))
+    train(config, tiny_data(), tmp_path, start=open_start(trained, config))
     with pytest.raises(EqrtError, match=r"another data: start \(\d+ there, absent here\)"):
         train(config, tiny_data(), tmp_path, resume=True)
-    again = train(
-        config, tiny_data(), tmp_path, origins=Origins(open_origin(trained, config)), resume=True
-    )
+    again = train(config, tiny_data(), tmp_path, start=open_start(trained, config), resume=True)
     assert again.step == 2
 
 
 def test_a_start_of_another_scene_says_which_fields_differ(trained: Path) -> None:
     other = tiny({"scene": {"lane_choice": "nearest"}})
     with pytest.raises(EqrtError, match=r"another scene: lane_choice \(routes there, nearest"):
-        open_origin(trained, other)
+        open_start(trained, other)
 
 
 def test_a_start_of_another_size_says_what_does_not_fit(trained: Path, tmp_path: Path) -> None:
     wider = tiny({"network": {"width": 32}}).with_steps(1)
     with pytest.raises(EqrtError, match="tensors do not fit this network"):
-        train(wider, tiny_data(), tmp_path, origins=Origins(open_origin(trained, wider)))
+        train(wider, tiny_data(), tmp_path, start=open_start(trained, wider))
