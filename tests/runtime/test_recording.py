@@ -35,7 +35,7 @@ from eqrt.runtime.recording.recorder import Recorder
 from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Step, TapedClock
 from eqrt.runtime.service import Service
-from processes import PATIENCE_S, Heard, eqrt
+from processes import PATIENCE_S, Heard, Serving, eqrt
 from recorded_drives import CHANNELS, patiently, recorded_drive
 from source_tree import ROOT
 
@@ -226,6 +226,27 @@ def test_predictions_go_on_when_the_writer_is_killed(tmp_path: Path) -> None:
     assert status == 0
     assert stderr.count("recording") == 1
     assert "recording ended" in stderr
+
+
+def test_predictions_go_on_when_the_writer_cannot_begin(tmp_path: Path) -> None:
+    """A damaged installation: what Python says of it does not say what it means for the service."""
+    damaged = tmp_path / "damaged"
+    (damaged / "mcap").mkdir(parents=True)
+    (damaged / "mcap/__init__.py").write_text("raise ImportError('damaged')")
+    channel = f"damaged-{time.monotonic_ns()}"
+    options = ["--can", channel, "--can-interface", LOCAL, "--profile", "generic", "--quiet"]
+    paths = f"{damaged}{os.pathsep}{ROOT / 'runtime'}"
+    with Heard(channel) as heard:
+        options += ["--datagrams", heard.address, "--record", str(tmp_path / "rec")]
+        service = Serving(*options, PYTHONPATH=paths).wait_until_ready()
+        patiently(
+            lambda: bool(heard.statuses) and heard.statuses[-1].totals["recording_ended"] == 1
+        )
+        status, _, stderr = service.end()
+    assert status == 0
+    assert "ImportError: damaged" in stderr
+    said = "eqrt serve: recording ended: its writer could not go on; predictions go on"
+    assert stderr.splitlines().count(said) == 1
 
 
 def test_the_writer_ends_after_a_service_that_was_killed(tmp_path: Path) -> None:

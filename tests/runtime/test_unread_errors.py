@@ -15,7 +15,7 @@ import pytest
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.prediction.protobuf import nested, text
-from eqrt.runtime.recording.order import Description, Order
+from eqrt.runtime.recording.order import SAID_WHY, Description, Order
 from eqrt.runtime.recording.reader import Recording
 from eqrt.runtime.recording.topics import LENGTH
 from handmade_model import sign, write_handmade
@@ -88,7 +88,7 @@ def test_a_writer_says_why_it_ended_when_somebody_reads(tmp_path: Path) -> None:
     )
     ended = f"eqrt serve: recording ended: {order.folder}: No such file or directory"
     assert done.stderr.decode() == f"{ended}; predictions go on\n"
-    assert done.returncode == 1
+    assert done.returncode == SAID_WHY
 
 
 def test_a_service_starts_although_nobody_reads_the_model_licence(tmp_path: Path) -> None:

@@ -1,8 +1,11 @@
-"""What the writer is told before the first entry."""
+"""What the writer is told before the first entry, and what its end tells."""
 
 from __future__ import annotations
 
 import msgspec
+
+SAID_WHY = 3
+"""Exit status of a writer that ended before its time, and said why in a line."""
 
 
 class Attached(msgspec.Struct, frozen=True):

@@ -24,7 +24,7 @@ from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.output.forecasts import ForecastSet
 from eqrt.runtime.output.status import ServiceStatus
 from eqrt.runtime.recording.exact_forecasts import encode_forecasts
-from eqrt.runtime.recording.order import Description, Order
+from eqrt.runtime.recording.order import SAID_WHY, Description, Order
 from eqrt.runtime.recording.pipe import MAX_WAITING_BYTES, PipeEnd
 from eqrt.runtime.recording.runs import RunTape
 from eqrt.runtime.recording.steps import Lost, PollEntry, TapedClock, can_entry
@@ -126,7 +126,7 @@ class Recorder:
         self._due_s = time.monotonic() + _BATCH_S
         self._pipe.push()
         if not self._pipe.is_open:
-            self._say_if_killed()
+            self._say_if_unexplained()
         if not self._batch:
             return
         batch, size = self._batch, self._batch_bytes
@@ -162,15 +162,14 @@ class Recorder:
 
     # ---
 
-    def _say_if_killed(self) -> None:
-        """Once; a writer that ended by itself has said why."""
+    def _say_if_unexplained(self) -> None:
+        """Once; of a writer that has not said why it ended."""
         code = self._writer.poll()
-        if code is not None and code < 0 and not self._is_said:
-            self._is_said = True
-            name = signal.Signals(-code).name
-            Outlet(sys.stderr).put(
-                f"eqrt serve: recording ended: its writer was killed ({name}); predictions go on"
-            )
+        if code in (None, SAID_WHY) or self._is_said:
+            return
+        self._is_said = True
+        how = f"was killed ({signal.Signals(-code).name})" if code < 0 else "could not go on"
+        Outlet(sys.stderr).put(f"eqrt serve: recording ended: its writer {how}; predictions go on")
 
     def _is_described(self) -> bool:
         """Whether the writer knows what the coming entries are of: nothing is sent before."""

@@ -24,7 +24,7 @@ from mcap.writer import Writer
 
 from eqrt.runtime.operation.outlet import Outlet
 from eqrt.runtime.recording.folder import delete_oldest, file_name, free_bytes, total_bytes
-from eqrt.runtime.recording.order import Attached, Description, Order
+from eqrt.runtime.recording.order import SAID_WHY, Attached, Description, Order
 from eqrt.runtime.recording.topics import (
     DESCRIPTION,
     ENTRY,
@@ -37,7 +37,6 @@ from eqrt.runtime.recording.topics import (
     Topic,
 )
 
-REACHED_A_LIMIT = 3
 _FLUSH_S = 1.0
 _CHUNK_BYTES = 1 << 20  # a chunk is closed before its second is over if it has grown to this
 _READ_BYTES = 1 << 20
@@ -69,9 +68,9 @@ def _record(order: Order, pieces: _Pieces) -> tuple[int, str]:
     try:
         _write(recording, pieces)
     except LimitReachedError as reached:
-        return REACHED_A_LIMIT, str(reached)
+        return SAID_WHY, str(reached)
     except OSError as error:
-        return 1, f"{order.folder}: {error.strerror}"
+        return SAID_WHY, f"{order.folder}: {error.strerror}"
     finally:
         with contextlib.suppress(OSError):
             recording.close()
