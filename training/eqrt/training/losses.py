@@ -62,6 +62,7 @@ def nearest_end_loss(
 
 SOFTNESS_M = 1.0
 """Modes whose errors differ by less are about as likely."""
+END_SHARE = 0.5
 FINAL_SHARE = 0.3
 NEAREST_END_SHARE = 0.1
 LIKELIHOOD_SHARE = 0.7
@@ -105,9 +106,6 @@ def ade_and_end_loss(
     likeliest = trajectories[:, :1]
     ade = mode_displacement(likeliest, future, valid)
     return (ade + END_SHARE * _final_displacement(likeliest, future, valid)).mean()
-
-
-END_SHARE = 0.5
 
 
 Loss = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
