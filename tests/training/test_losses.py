@@ -6,12 +6,10 @@ import numpy as np
 import torch
 
 from eqrt.training.losses import (
-    END_SHARE,
     FINAL_SHARE,
     LIKELIHOOD_SHARE,
     NEAREST_END_SHARE,
     SPREAD_SHARE,
-    ade_and_end_loss,
     ade_loss,
     best_mode_loss,
     mode_displacement,
@@ -50,16 +48,6 @@ def test_ade_is_that_of_the_first_mode() -> None:
     torch.testing.assert_close(
         ade_loss(swapped, torch.ones(1, 2), FUTURE, VALID), torch.tensor(5.0)
     )
-
-
-def test_the_end_may_count_on_its_own_as_far_as_it_was_seen() -> None:
-    """The first mode: 5 m off at both steps that were seen; with the first step right, 2.5 m."""
-    swapped = two_modes().flip(1)
-    everywhere = ade_and_end_loss(swapped, torch.ones(1, 2), FUTURE, VALID)
-    torch.testing.assert_close(everywhere, torch.tensor(5.0 + END_SHARE * 5.0))
-    swapped[0, 0, 0] = 0.0
-    late = ade_and_end_loss(swapped, torch.ones(1, 2), FUTURE, VALID)
-    torch.testing.assert_close(late, torch.tensor(2.5 + END_SHARE * 5.0), atol=1e-3, rtol=0.0)
 
 
 def test_soft_modes_pull_the_better_mode_and_its_end_as_far_as_it_was_seen() -> None:

@@ -19,7 +19,7 @@ import msgspec
 from eqrt.core.errors import EqrtError, UsageError
 from eqrt.training.augment import AugmentConfig
 from eqrt.training.dataset.windows import WindowOptions
-from eqrt.training.losses import LOSSES, OF_ONE_MODE
+from eqrt.training.losses import LOSSES
 from eqrt.training.networks.registry import ModelConfig
 from eqrt.training.tables import (
     Count,
@@ -132,11 +132,8 @@ class TrainConfig:
             else None,
         )
         modes = config.model.scene.num_modes
-        if config.train.loss in OF_ONE_MODE and modes > 1:
-            raise ValueError(
-                f"[train] loss {config.train.loss!r} trains one mode, [scene] has {modes}; "
-                "best_mode?"
-            )
+        if config.train.loss == "ade" and modes > 1:
+            raise ValueError(f"[train] loss 'ade' trains one mode, [scene] has {modes}; best_mode?")
         return config
 
     def to_tables(self) -> Tables:

@@ -62,7 +62,6 @@ def nearest_end_loss(
 
 SOFTNESS_M = 1.0
 """Modes whose errors differ by less are about as likely."""
-END_SHARE = 0.5
 FINAL_SHARE = 0.3
 NEAREST_END_SHARE = 0.1
 LIKELIHOOD_SHARE = 0.7
@@ -93,29 +92,11 @@ def ade_loss(trajectories: Tensor, probabilities: Tensor, future: Tensor, valid:
     return mode_displacement(trajectories[:, :1], future, valid).mean()
 
 
-def ade_and_end_loss(
-    trajectories: Tensor,
-    probabilities: Tensor,  # noqa: ARG001 (every loss is called alike)
-    future: Tensor,
-    valid: Tensor,
-) -> Tensor:
-    """As `ade_loss`, and the last seen step counts END_SHARE on its own.
-
-    It is the hardest one, and one of thirty in the ADE.
-    """
-    likeliest = trajectories[:, :1]
-    ade = mode_displacement(likeliest, future, valid)
-    return (ade + END_SHARE * _final_displacement(likeliest, future, valid)).mean()
-
-
 Loss = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 """Of trajectories (B, K, H, 2), probabilities (B, K), future (B, H, 2), valid (B, H): the mean."""
 
-OF_ONE_MODE = frozenset({"ade", "ade_and_end"})
-"""Those that teach the most probable mode alone."""
 LOSSES: Mapping[str, Loss] = {
     "ade": ade_loss,
-    "ade_and_end": ade_and_end_loss,
     "best_mode": best_mode_loss,
     "soft_mode": soft_mode_loss,
     "nearest_end": nearest_end_loss,
