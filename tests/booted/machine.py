@@ -28,8 +28,6 @@ import sys
 from eqrt.cli import main
 sys.exit(main())
 """
-
-
 INSTALLED = {
     "python": Path(sys.base_prefix),
     "packages": Path(sysconfig.get_path("purelib")),
@@ -43,6 +41,15 @@ printf '%s\\n' {HOME}/packages {HOME}/runtime > {HOME}/lib/{PYTHON}/site-package
 cat > {HOME}/bin/eqrt <<'END'
 {PROGRAM}END
 chmod 755 {HOME}/bin/eqrt"""
+FIRST_PROGRAM = """[Unit]
+DefaultDependencies=no
+Wants=systemd-journald.service dbus.socket
+After=systemd-journald.service dbus.socket
+[Service]
+Type=oneshot
+ExecStart=/bin/sh /run/first-program
+ExecStopPost=/bin/systemctl poweroff --force --force
+"""
 
 
 def missing() -> str | None:
@@ -76,34 +83,14 @@ mount -t hostfs -o {shlex.quote(str(work))} none {shlex.quote(str(work))}
 {VIRTUAL_ENVIRONMENT}
 {SETUP}
 cat > /run/first-program <<'END'
-{_first_program(command, work, timeout_s)}END
+{uml.exports(work)}
+{uml.to_its_end(command, work, timeout_s)}
+sync
+END
 mkdir -p /run/systemd/system
 cat > /run/systemd/system/first-program.service <<'END'
 {FIRST_PROGRAM}END
 exec {SYSTEMD} --unit=first-program.service --log-target=null --show-status=false
-"""
-
-
-FIRST_PROGRAM = """[Unit]
-DefaultDependencies=no
-Wants=systemd-journald.service dbus.socket
-After=systemd-journald.service dbus.socket
-[Service]
-Type=oneshot
-ExecStart=/bin/sh /run/first-program
-ExecStopPost=/bin/systemctl poweroff --force --force
-"""
-
-
-def _first_program(command: Sequence[str], work: Path, timeout_s: float) -> str:
-    machine = uml.machine_folder(work)
-    return f"""{uml.exports(work)}
-cd {shlex.quote(str(work))}
-status=0
-timeout --kill-after=1 {timeout_s} {shlex.join(command)} \\
-    < /dev/null > {machine}/stdout 2> {machine}/stderr || status=$?
-echo $status > {machine}/status
-sync
 """
 
 

@@ -52,7 +52,7 @@ def test_it_predicts_on_can_and_is_heard_over_loopback(found: dict[str, Any]) ->
     assert heard["predicted"] in SOME
     assert heard["datagrams"] >= heard["predicted"]
     assert heard["counted"] in SOME
-    assert found["status_text"].startswith(("RUN ", "LATE ", "SILENT"))
+    assert "messages/s" in found["status_text"]  # the status line
 
 
 def test_reload_waits_until_a_tile_is_exchanged_or_refused(found: dict[str, Any]) -> None:
@@ -61,9 +61,9 @@ def test_reload_waits_until_a_tile_is_exchanged_or_refused(found: dict[str, Any]
     for step in (damaged, right):
         assert step["reload"] == [0, ""]
         assert {name: step[name] for name in WELL} == WELL
-    assert "error: reload failed, tile and model stay" in damaged["said"][-1]
-    assert "not a tile" in damaged["said"][-1]
-    assert right["said"][-1].startswith("reloaded: ")
+    (failed,) = (line for line in damaged["said"] if "reload failed, tile and model stay" in line)
+    assert "not a tile" in failed
+    assert sum(line.startswith("reloaded: ") for line in right["said"]) == 1
     assert found["reloaded"]["same"]
     assert found["predicted_after_reload"] in SOME
 

@@ -74,9 +74,18 @@ def exports(work: Path) -> str:
     return "\n".join(f"export {k}={shlex.quote(v)}" for k, v in environment(work).items())
 
 
+def to_its_end(command: Sequence[str], work: Path, timeout_s: float) -> str:
+    """Shell lines that run the command in `work` and leave what `boot` asks for."""
+    machine = shlex.quote(str(machine_folder(work)))
+    return f"""cd {shlex.quote(str(work))}
+status=0
+timeout --kill-after=1 {timeout_s} {shlex.join(command)} \\
+    < /dev/null > {machine}/stdout 2> {machine}/stderr || status=$?
+echo $status > {machine}/status"""
+
+
 def _init(command: Sequence[str], work: Path, timeout_s: float) -> str:
     """The guest's first process: a shell script that powers the guest off, however it ends."""
-    machine = machine_folder(work)
     return f"""#!/bin/sh -e
 trap 'sync; echo o > /proc/sysrq-trigger; sleep 60' EXIT
 {exports(work)}
@@ -89,11 +98,7 @@ echo 8388608 > /proc/sys/net/core/rmem_default
 mount -t hostfs -o {shlex.quote(str(work))} none {shlex.quote(str(work))}
 {insert(DRIVERS)}
 {SETUP}
-cd {shlex.quote(str(work))}
-status=0
-timeout --kill-after=1 {timeout_s} {shlex.join(command)} \\
-    < /dev/null > {machine}/stdout 2> {machine}/stderr || status=$?
-echo $status > {machine}/status
+{to_its_end(command, work, timeout_s)}
 """
 
 

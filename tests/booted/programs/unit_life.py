@@ -71,6 +71,7 @@ def pid() -> int:
 
 def said() -> list[str]:
     """All that the service has written to the journal so far."""
+    subprocess.run(["journalctl", "--sync"], check=True)
     command = ["journalctl", "--unit", "eqrt", "--output", "cat", "--no-pager"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.splitlines()

@@ -22,11 +22,11 @@ from eqrt.training.dataset.windows import WindowOptions
 from eqrt.training.losses import LOSSES
 from eqrt.training.networks.registry import ModelConfig
 from eqrt.training.tables import (
+    BoundedCount,
     Count,
     NotNegative,
     PartialShare,
     Positive,
-    Width,
     check_names,
     fill,
 )
@@ -72,7 +72,7 @@ class LoopConfig:
 
     steps: Count | None = None
     epochs: Positive | None = None
-    batch_size: Width
+    batch_size: BoundedCount
     """Windows per step, those of all processes together."""
     optimizer: Literal["adam", "adamw", "muon"]
     learning_rate: Positive

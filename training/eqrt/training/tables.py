@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import msgspec
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
-Width = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
-"""Of what lies in memory side by side: more is a slip of the pen."""
+BoundedCount = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+"""Of what must all be in memory at once: more is a slip of the pen."""
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 """Or a probability."""
 PartialShare = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]

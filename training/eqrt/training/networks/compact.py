@@ -33,7 +33,7 @@ from eqrt.training.networks.spread import SpreadDecoder, tile_covariances
 from eqrt.training.networks.target_frame import FRAMES, HEADINGS
 from eqrt.training.networks.target_view import TOKENS, TargetView
 from eqrt.training.networks.time_basis import BASIS, time_basis
-from eqrt.training.tables import PartialShare, Width, check_choice, check_multiple
+from eqrt.training.tables import BoundedCount, PartialShare, check_choice, check_multiple
 
 _MASKED = 1e9  # a finite infinity: a row without any valid token must not become NaN
 
@@ -42,13 +42,13 @@ _MASKED = 1e9  # a finite infinity: a row without any valid token must not becom
 class CompactConfig:
     """Table [network] with kind = "compact"."""
 
-    width: Width
+    width: BoundedCount
     """Of a token; a multiple of `heads`."""
-    hidden: Width
+    hidden: BoundedCount
     """Of the perceptrons."""
-    heads: Width
+    heads: BoundedCount
     """Ways in which a mode looks at the tokens at once."""
-    layers: Width
+    layers: BoundedCount
     """In each of which every mode looks at all tokens."""
     dropout: PartialShare
     """Share of updates dropped while training."""

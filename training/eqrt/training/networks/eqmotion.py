@@ -32,7 +32,7 @@ from eqrt.training.networks.map_tokens import AttentionEncoder, TransformerEncod
 from eqrt.training.networks.modes import most_probable_first
 from eqrt.training.networks.raster import Pixels, RasterEncoder
 from eqrt.training.networks.target_frame import FRAMES, HEADINGS, MapPoints, TargetFrame
-from eqrt.training.tables import PartialShare, Positive, Width, check_choice, check_multiple
+from eqrt.training.tables import BoundedCount, PartialShare, Positive, check_choice, check_multiple
 
 MAPS = ("none", "attention", "transformer", "raster")
 """The map encoders."""
@@ -42,13 +42,13 @@ MAPS = ("none", "attention", "transformer", "raster")
 class EqMotionConfig:
     """Table [network] with kind = "eqmotion"."""
 
-    hidden: Width
+    hidden: BoundedCount
     """C = D: vectors per agent, and every width that is not named below."""
-    layers: Width
+    layers: BoundedCount
     """P, feature-learning layers."""
-    mlp_layers: Width
+    mlp_layers: BoundedCount
     """Layers of every perceptron."""
-    categories: Width
+    categories: BoundedCount
     """R, interaction categories."""
     map: str
     """One of MAPS."""
@@ -56,16 +56,16 @@ class EqMotionConfig:
     """`translated` or `rotated` (`eqrt.training.networks.target_frame`)."""
     heading: str
     """`one_step` or `robust` (the same module)."""
-    heads: Width
+    heads: BoundedCount
     """Of the transformer."""
-    token_width: Width
+    token_width: BoundedCount
     """Of a map point in the attention or the transformer; there a multiple of `heads`."""
     image_pixels: Pixels
     """Of one side of the drawn map (map = "raster"), a multiple of 4."""
     image_cell_m: Positive
-    image_channels: Width
+    image_channels: BoundedCount
     """Of both convolutions."""
-    image_width: Width
+    image_width: BoundedCount
     """First layer of the perceptron that reads the image."""
     point_dropout: PartialShare = 0.0
     """Share of the map's points that a training step does not read (attention, transformer)."""

@@ -16,23 +16,23 @@ from eqrt.training.networks.config import UNIT_M, SceneConfig
 from eqrt.training.networks.layers import mlp
 from eqrt.training.networks.modes import most_probable_first
 from eqrt.training.networks.raster import Pixels, RasterEncoder
-from eqrt.training.tables import Positive, Width
+from eqrt.training.tables import BoundedCount, Positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LstmConfig:
     """Table [network] with kind = "lstm"."""
 
-    hidden: Width
-    """Width of the LSTM, of the features and of the perceptrons."""
-    mlp_layers: Width
+    hidden: BoundedCount
+    """BoundedCount of the LSTM, of the features and of the perceptrons."""
+    mlp_layers: BoundedCount
     """Layers of every perceptron."""
     image_pixels: Pixels
     """Of one side of the drawn map, a multiple of 4."""
     image_cell_m: Positive
-    image_channels: Width
+    image_channels: BoundedCount
     """Of both convolutions."""
-    image_width: Width
+    image_width: BoundedCount
     """First layer of the perceptron that reads the image."""
 
 
