@@ -22,7 +22,7 @@ from eqrt.export.vectors import (
     without_neighbours,
 )
 from eqrt.training.losses import best_mode_loss, spread_loss
-from eqrt.training.networks.canonical import canonical_from_tile
+from eqrt.training.networks.canonical import canonical_from_tile, heading_vector
 from eqrt.training.networks.compact import CompactConfig, CompactPredictor, ModeLayer
 from eqrt.training.networks.config import SceneConfig
 from eqrt.training.networks.registry import ModelConfig
@@ -265,15 +265,54 @@ def test_a_layer_is_the_usual_attention_although_it_computes_no_keys_and_no_valu
     torch.testing.assert_close(told, expected.flatten(0, 1))
 
 
-def test_a_slowly_stopping_target_is_predicted_without_a_jump(model: CompactPredictor) -> None:
+@pytest.mark.parametrize(
+    ("apart_deg", "least"), [(0.0, 1.0), (60.0, 1.0), (115.0, 1.0), (150.0, 0.5), (180.0, 0.0)]
+)
+def test_a_heading_is_whole_unless_its_sources_contradict_each_other(
+    apart_deg: float, least: float
+) -> None:
+    """The shortest at any speed, and nowhere does it turn or shrink faster than speed changes."""
+    speed = torch.linspace(0.0, 2.0, 2001).double().unsqueeze(1)
+    angle = torch.deg2rad(torch.tensor(apart_deg).double())
+    measured = torch.stack([angle.cos(), angle.sin()]).expand(2001, 2)
+    heading = heading_vector(speed * torch.tensor([1.0, 0.0]), measured, torch.zeros(2001, 2))
+    lengths = heading.norm(dim=1)
+    assert float(lengths.max()) <= 1.0 + 1e-12
+    assert float(lengths.min()) == pytest.approx(least, abs=0.02)
+    torch.testing.assert_close(heading[-1], torch.tensor([1.0, 0.0]).double())
+    assert float((heading[1:] - heading[:-1]).norm(dim=1).max()) < 0.01  # per mm/s
+
+
+def test_the_slightest_motion_is_a_heading_where_nothing_else_is() -> None:
+    moved, none = torch.tensor([[0.0, 0.02], [0.3, 0.4]]), torch.zeros(2, 2)
+    expected = torch.tensor([[0.0, 1.0], [0.6, 0.8]])
+    torch.testing.assert_close(heading_vector(moved, none, none), expected)
+
+
+def facing(scene: Scene, direction: float, *, measured: bool) -> Scene:
+    """Its target moves along +x: so (1), or against it (-1), leads what else says its heading."""
+    if measured:
+        return replace(scene, heading=np.array([[direction, 0.0]], np.float32))
+    onward = slice(None, None, int(direction))
+    lines, valid = scene.centerlines[:, :, onward], scene.centerlines_valid[:, :, onward]
+    return replace(scene, centerlines=lines.copy(), centerlines_valid=valid.copy())
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_a_slowly_stopping_target_is_predicted_without_a_jump(
+    model: CompactPredictor, direction: float, measured: bool
+) -> None:
     """Between driving, crawling and standing the expected end moves, but nowhere jumps.
 
-    Where it moves most from one speed to the next, it moves in proportion to the difference.
+    Where it moves most from one speed to the next, it moves in proportion to the difference. So
+    does one that reverses, and one that creeps against the lanes beside it.
     """
 
     def ends(speeds: np.ndarray) -> np.ndarray:
         """Expectation over the modes, whose order changes where two are as probable."""
-        pairs = [predict(model, move(road_scene(CONTRACT, float(v)), SOMEWHERE)) for v in speeds]
+        roads = [facing(road_scene(CONTRACT, v), direction, measured=measured) for v in speeds]
+        pairs = [predict(model, move(road, SOMEWHERE)) for road in roads]
         return np.array([probabilities[0] @ paths[0, :, -1] for paths, probabilities in pairs])
 
     speeds = np.linspace(2.0, 0.0, 101)

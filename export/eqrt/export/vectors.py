@@ -20,7 +20,11 @@ RADIUS_M = 220.0
 LANE_WIDTH_M = 3.5
 TURNED = Pose2(-431.7, 212.3, 2.1)
 """Where the turned and shifted twin of a scene lies."""
-TWINS = {"driving_turned": "driving", "stopped_turned": "stopped_no_heading"}
+TWINS = {
+    "driving_turned": "driving",
+    "stopped_turned": "stopped_no_heading",
+    "reversing_turned": "reversing",
+}
 """Scenes that are others, turned and shifted by TURNED."""
 FAR = Pose2(700.0, -700.0, 0.0)
 """The edge of a tile: 1 km from its origin."""
@@ -52,8 +56,12 @@ def _driving_scenes(contract: ModelContract) -> dict[str, Scene]:
 
 def _standing_scenes(contract: ModelContract) -> dict[str, Scene]:
     stopped = road_scene(contract, speed_mps=0.0)
+    creeping = road_scene(contract, speed_mps=0.7)
+    reversing = replace(creeping, heading=np.array([[-1.0, 0.0]], np.float32))
     return {
         "crawling": road_scene(contract, speed_mps=0.6),
+        "reversing": reversing,
+        "reversing_turned": move(reversing, TURNED),
         "stopped": replace(stopped, heading=np.array([[1.0, 0.0]], np.float32)),
         "stopped_no_heading": stopped,
         "stopped_turned": move(stopped, TURNED),

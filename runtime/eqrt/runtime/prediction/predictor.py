@@ -97,23 +97,27 @@ class Predictor:
 
     def predict(self, scene: Scene) -> Prediction:
         """Predict all targets of the scene, at least one."""
-        inputs = scene.inputs()
-        runs = [
-            self._session.run(
-                self._outputs, {name: rows[at : at + MAX_BATCH] for name, rows in inputs.items()}
-            )
-            for at in range(0, len(scene.history), MAX_BATCH)
-        ]
-        found = {
-            name: np.concatenate(parts)
-            for name, parts in zip(self._outputs, zip(*runs, strict=True), strict=True)
-        }
+        found = dict(zip(self._outputs, self._run(scene.inputs()), strict=True))
         covariances = found.get("covariances")  # the map frame's axes are the tile's
         return Prediction(
             found["trajectories"] + scene.origin,
             found["probabilities"],
             None if covariances is None else covariances.astype(np.float64),
         )
+
+    def _run(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[np.float32]]:
+        """The outputs, MAX_BATCH targets at a time."""
+        targets = len(inputs["history"])
+        if targets <= MAX_BATCH:
+            only: list[NDArray[np.float32]] = self._session.run(self._outputs, inputs)
+            return only
+        runs = [
+            self._session.run(
+                self._outputs, {name: rows[at : at + MAX_BATCH] for name, rows in inputs.items()}
+            )
+            for at in range(0, targets, MAX_BATCH)
+        ]
+        return [np.concatenate(parts) for parts in zip(*runs, strict=True)]
 
     def again(self) -> Predictor:
         """The same artifact, loaded anew. Raises ContractError, as `load` does."""

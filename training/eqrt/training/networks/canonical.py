@@ -19,6 +19,8 @@ DRIVE_M = 1.2
 """Motion above this defines the heading alone. Between the two, the sources are mixed."""
 CRAWL_SHARE = 0.01
 """What the slightest motion counts beside them: with nothing else, it must do."""
+AGREED_SHARE = 0.5
+"""Sources that weigh the same define a heading if they are up to 120 degrees apart."""
 _TINY = 1e-3
 """A millimetre, where lengths meet zero. Constants below 1e-8 are not safe: the ONNX exporter's
 optimiser takes an added one for zero and drops it."""
@@ -97,11 +99,19 @@ def heading_vector(moved: Tensor, heading: Tensor, lane: Tensor) -> Tensor:
 
     moved (B, 2): displacement over the last second, metres. heading (B, 2): measured, or 0. lane
     (B, 2): `LaneDirection`.
+
+    Where motion points against the other source, as of a car that reverses, their mixture turns
+    round between one speed and another. It must not jump: there it is shorter than 1, down to 0
+    where they are equal and opposite, and comes out longer again on the other side.
     """
     standing = heading + (1.0 - length(heading)) * lane
     far = length(moved)
     weight = ((far - CRAWL_M) / (DRIVE_M - CRAWL_M)).clamp(CRAWL_SHARE, 1.0)
-    return unit(weight * moved / far.clamp(min=_TINY) + (1.0 - weight) * standing)
+    by_motion = weight * moved / far.clamp(min=_TINY)
+    by_place = (1.0 - weight) * standing
+    mixed = by_motion + by_place
+    agreed = AGREED_SHARE * (length(by_motion) + length(by_place))
+    return mixed / torch.maximum(length(mixed), agreed).clamp(min=_TINY)
 
 
 def canonical_from_tile(heading: Tensor) -> Tensor:

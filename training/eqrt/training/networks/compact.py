@@ -106,19 +106,19 @@ class CompactPredictor(nn.Module):
 class TokenEncoder(nn.Module):
     """A perceptron from what is known of an agent, or of a lane, to its token."""
 
-    scale: Tensor
-    """(F,) brings the numbers to about 1; folded into the weights when exported."""
+    inputs: Tensor
+    """(F, known): what is read, of what is known; folded into the weights when exported."""
 
-    def __init__(self, scale: list[float], config: CompactConfig) -> None:
+    def __init__(self, inputs: Tensor, config: CompactConfig) -> None:
         super().__init__()
-        self.register_buffer("scale", torch.tensor(scale), persistent=False)
-        self.widen = nn.Linear(len(scale), config.hidden)
+        self.register_buffer("inputs", inputs, persistent=False)
+        self.widen = nn.Linear(len(inputs), config.hidden)
         self.narrow = nn.Sequential(nn.SiLU(), nn.Linear(config.hidden, config.width))
 
     def forward(self, known: Tensor) -> Tensor:
-        """(B, 1, M, F) -> (B, M, W), as products of two matrices."""
+        """(B, 1, M, known) -> (B, M, W), as products of two matrices."""
         rows = known.flatten(0, 2)
-        wide = torch.nn.functional.linear(rows, self.widen.weight * self.scale, self.widen.bias)
+        wide = torch.nn.functional.linear(rows, self.widen.weight @ self.inputs, self.widen.bias)
         tokens: Tensor = self.narrow(wide)
         return tokens.view(-1, known.shape[2], tokens.shape[-1])
 

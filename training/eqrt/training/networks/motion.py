@@ -29,9 +29,10 @@ class FittedMotion:
     """(B, 2, N, T) metres, where it was before, from there; 0 where not seen."""
     velocity: Tensor
     """(B, 2, N, S) m/s, fitted over SLOPE_STEPS."""
-    vectors: tuple[Tensor, ...]
-    """(B, 2, N, .) metres and m/s, V together: how each agent left its mean course, and how its
-    course of half a second and of two seconds differs from it."""
+    off_course: Tensor
+    """(B, 2, N, T) metres, how it left its mean course; 0 where not seen."""
+    change: Tensor
+    """(B, 2, N, T - 1) m/s, of that from step to step; 0 where one of the two was not seen."""
 
 
 class MotionFit(nn.Module):
@@ -40,33 +41,43 @@ class MotionFit(nn.Module):
     The deviations are where braking and turning show; they are centimetres beside tens of metres.
     """
 
-    time: Tensor
-    """(T,) seconds, the last is 0."""
     later: Tensor
     """(T, T): column t counts against a step the valid ones after it."""
     sums: Tensor
-    """(T, 3 S): per window of SLOPE_STEPS, sums of 1, of t, and of t^2."""
+    """(T, 2 S): per window of SLOPE_STEPS, sums of 1, then of t."""
+    squares: Tensor
+    """(T, 2 S): likewise of t^2, then of t."""
+    places: Tensor
+    """(T, 2 S): likewise of t, then of 1."""
+    difference: Tensor
+    """(2 S, S): the first half minus the second."""
+    course: Tensor
+    """(S, T): where the mean course was at each step, seconds."""
     neighbours: Tensor
     """(T, T - 1): adds each two steps that follow each other."""
-    change: Tensor
+    steps: Tensor
     """(T, T - 1): from each step to the next, per second."""
 
     def __init__(self, scene: SceneConfig) -> None:
         super().__init__()
-        steps, self.dt_s = scene.history_steps, scene.dt_s
+        steps, windows = scene.history_steps, len(SLOPE_STEPS)
         time = torch.arange(1 - steps, 1) * scene.dt_s
         within = torch.stack([time > -(n - 0.5) * scene.dt_s for n in SLOPE_STEPS], -1).to(time)
-        powers = [within * time.unsqueeze(-1) ** power for power in range(3)]
+        one, by_time, by_time2 = (within * time.unsqueeze(-1) ** power for power in range(3))
         before, after = torch.eye(steps)[:, :-1], torch.eye(steps)[:, 1:]
         constants = {
-            "time": time,
             "later": torch.eye(steps) - torch.ones(steps, steps).tril(-1),
-            "sums": torch.cat(powers, -1),
+            "sums": torch.cat([one, by_time], -1),
+            "squares": torch.cat([by_time2, by_time], -1),
+            "places": torch.cat([by_time, one], -1),
+            "difference": torch.cat([torch.eye(windows), -torch.eye(windows)]),
+            "course": torch.eye(windows)[:, COURSE : COURSE + 1] * time,
             "neighbours": before + after,
-            "change": (after - before) / scene.dt_s,
+            "steps": (after - before) / scene.dt_s,
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
+        self._least_spread = 0.25 * scene.dt_s**2
 
     def forward(self, history: Tensor, valid: Tensor) -> FittedMotion:
         """Masked history (B, 2, N, T) in metres, valid (B, 1, N, T) 1 or 0."""
@@ -74,20 +85,14 @@ class MotionFit(nn.Module):
         last = (is_last * history).sum(-1, keepdim=True)
         relative = (history - last) * valid
         velocity = self._slopes(relative, valid)
-        course = velocity[..., COURSE : COURSE + 1]
-        off_course = (relative - course * self.time) * valid
+        off_course = (relative - velocity @ self.course) * valid
         both = (valid @ self.neighbours - 1.0).relu()
-        change = (off_course @ self.change) * both
-        return FittedMotion(last, relative, velocity, (off_course, change, velocity - course))
+        change = (off_course @ self.steps) * both
+        return FittedMotion(last, relative, velocity, off_course, change)
 
     def _slopes(self, relative: Tensor, valid: Tensor) -> Tensor:
         """Least-squares velocities (B, 2, N, S) over the seen steps of each window; 0 for one."""
-        count, time, time2 = (valid @ self.sums).chunk(3, -1)
-        place, place_time = (relative @ self.sums[:, : 2 * len(SLOPE_STEPS)]).chunk(2, -1)
-        spread = (count * time2 - time * time).clamp(min=0.25 * self.dt_s**2)
-        return (count * place_time - time * place) / spread
-
-
-def fitted_vectors(scene: SceneConfig) -> int:
-    """V of FittedMotion."""
-    return 2 * scene.history_steps - 1 + len(SLOPE_STEPS)
+        sums = valid @ self.sums
+        spread = (sums * (valid @ self.squares)) @ self.difference
+        along = (sums * (relative @ self.places)) @ self.difference
+        return along / spread.clamp(min=self._least_spread)

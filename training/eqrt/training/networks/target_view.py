@@ -14,11 +14,13 @@ from eqrt.training.networks.canonical import (
     unit,
 )
 from eqrt.training.networks.config import UNIT_M, SceneConfig
-from eqrt.training.networks.motion import COURSE, SLOPE_STEPS, MotionFit, fitted_vectors
+from eqrt.training.networks.motion import COURSE, SLOPE_STEPS, MotionFit
 from eqrt.training.networks.target_frame import one_step_heading, upright
 
 TOKENS = ("line", "point")
 """What a token of the map is."""
+_NEAR, _FAR = 1.0, 1.0 / UNIT_M
+"""What brings metres of deviation to about 1, and tens of metres of place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +54,10 @@ class TargetView(nn.Module):
         self.heading, self.frame, self.tokens = heading, frame, tokens
         self.motion = MotionFit(scene)
         self.lane_direction = LaneDirection(scene.centerline_points)
-        steps, slopes, vectors = scene.history_steps, len(SLOPE_STEPS), fitted_vectors(scene)
-        near, far = [1.0], [1.0 / UNIT_M]  # metres of deviation, and tens of metres of place
-        self.of_agent = 2 * (near * vectors + far * (steps + slopes + 1)) + near * steps
-        """What brings each number of an agent to about 1."""
-        points = scene.centerline_points
-        of_line = 2 * points * far + points * near
-        self.of_lane = of_line if tokens == "line" else 2 * (far + near)
+        self.of_agent = _of_agent(scene.history_steps)
+        """(F, numbers of an agent): the F inputs of a perceptron that they make."""
+        of_line = 2 * scene.centerline_points * [_FAR] + scene.centerline_points * [_NEAR]
+        self.of_lane = torch.diag(torch.tensor(of_line if tokens == "line" else 2 * [_FAR, _NEAR]))
         """Likewise of a token of the map."""
 
     def forward(
@@ -83,7 +82,8 @@ class TargetView(nn.Module):
         turn = self._turn(places, history_valid, heading, motion.velocity, lane)
 
         place = motion.last - origin
-        vectors = torch.cat([*motion.vectors, motion.relative, motion.velocity, place], -1)
+        numbers = [motion.off_course, motion.change, motion.velocity, motion.relative, place]
+        vectors = torch.cat(numbers, -1)
         lanes, lanes_valid = self._lanes(points, points_valid, turn)
         exists = valid.amax(-1)  # (B, 1, N)
         return Seen(
@@ -115,6 +115,22 @@ class TargetView(nn.Module):
             return _turned(turn, both), (valid * defined).flatten(2)
         lines = _turned(turn, points)  # (B, 1, Q, 2 L)
         return torch.cat([lines, valid], -1), valid.amax(-1)
+
+
+def _of_agent(steps: int) -> Tensor:
+    """(2 V + T, 2 W + T): what a perceptron reads of an agent, of the numbers that are at hand.
+
+    Those of each coordinate, then which steps were seen. It reads one thing more than there is: how
+    each velocity differs from the mean course, which is linear in them and costs no operator so.
+    """
+    sizes = [2 * steps - 1, len(SLOPE_STEPS), steps, 1]
+    deviation, velocity, relative, place = torch.split(torch.eye(sum(sizes)), sizes)
+    off_course = velocity - velocity[COURSE]
+    near, far = torch.cat([deviation, off_course]), torch.cat([relative, velocity, place])
+    axis = torch.cat([_NEAR * near, _FAR * far])
+    seen = _NEAR * torch.eye(steps)
+    whole: Tensor = torch.block_diag(axis, axis, seen)  # type: ignore[no-untyped-call]
+    return whole
 
 
 def _turned(turn: Tensor, vectors: Tensor) -> Tensor:
