@@ -1,1 +1,2 @@
-BprobabilitiesJ-ff>«L>÷G>Ì‘!>çšæ=¯ƒá=
+BprobabilitiesJ:ff>·L>
+÷G>Ø‘!>íšæ=sƒá=

@@ -1,1 +1,1 @@
-BprobabilitiesJff>4L>°÷G>]‘!>šæ=k…á=
+BprobabilitiesJff>AL>÷G>h‘!>šæ=W…á=

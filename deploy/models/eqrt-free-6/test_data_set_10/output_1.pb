@@ -1,1 +1,1 @@
-BprobabilitiesJ‘†>ûv>ºWo>õQ<>}z=O"<
+BprobabilitiesJ³c>ÿÌa>æÂP>_)>£&>vÓ<

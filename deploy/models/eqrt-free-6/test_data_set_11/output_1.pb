@@ -1,1 +1,1 @@
-BprobabilitiesJ·Й├>╗┌~>ьr>ЬP:>u=kД <
+BprobabilitiesJ╓▐c>3мa>ыбP>У^)>▐&>Nvс<

@@ -1,1 +1,1 @@
-BprobabilitiesJ£ê†>¡‚~>èr>ïP:>øu=Yä <
+BprobabilitiesJ†>õv>¼Wo>úQ<>}z=O"<

@@ -1,1 +1,1 @@
-BprobabilitiesJÀn>?m`>2?>Ø¶)>"Ñø=—=
+BprobabilitiesJ¡ê†>ª‚~>är>ðP:>éu=Zä <

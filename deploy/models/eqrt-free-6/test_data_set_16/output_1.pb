@@ -1,1 +1,1 @@
-BprobabilitiesJE±q>0Ÿn>¹±=>É·*>ÝKÖ=@@˜=
+BprobabilitiesJÀn>Hm`>#2?>½¶)>PÑø=Y—=

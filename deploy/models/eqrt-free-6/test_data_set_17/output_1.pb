@@ -1,1 +1,1 @@
-BprobabilitiesJªCT>Ž3Q>÷B>š+>iæ>†ÿ°=
+BprobabilitiesJLÀn>Ýl`>~1?>·)>óÏø=œ—=

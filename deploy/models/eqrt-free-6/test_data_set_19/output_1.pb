@@ -1,1 +1,1 @@
-BprobabilitiesJÄSg> a>}B>@ÿ#>ùkø=}²¨=
+BprobabilitiesJ°CT>3Q>ñB>Ÿ+>oæ>€ÿ°=

@@ -1,1 +1,1 @@
-BprobabilitiesJsff>ÆL>×öG>’!>Þšæ=û‚á=
+BprobabilitiesJlff>ÃL>ÞöG>’!>ëšæ=ô‚á=

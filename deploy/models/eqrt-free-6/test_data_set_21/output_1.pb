@@ -1,1 +1,1 @@
-BprobabilitiesJÄSg> a>}B>@ÿ#>ùkø=}²¨=
+BprobabilitiesJ¾Sg>® a>(}B>3ÿ#>lø=v²¨=

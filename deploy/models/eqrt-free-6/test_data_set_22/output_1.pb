@@ -1,1 +1,1 @@
-BprobabilitiesJ˚ñÅ>1Ît>sC>‚e>öz«=qàé=
+BprobabilitiesJ}∆e>√Äb>ü\C>^Q$>Ô!>ù—ï=

@@ -1,1 +1,1 @@
-BprobabilitiesJb‹>*yB>oÍA>~F>2æ=j+·=
+BprobabilitiesJb‹>+yB>[ÍA>†F>2æ=t+·=

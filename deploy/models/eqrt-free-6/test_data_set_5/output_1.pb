@@ -1,1 +1,1 @@
-BprobabilitiesJ_ÜC>¡„@>8Ÿ;>Ó()>·ÿ>‰®÷=
+BprobabilitiesJYÜC>ž„@>GŸ;>Ñ()>³ÿ>ƒ®÷=

@@ -1,1 +1,1 @@
-BprobabilitiesJpÑ>nSq>D0/>l¿(>‚¢Ñ=V4œ=
+BprobabilitiesJvÑ>oSq>I0/>k¿(>y¢Ñ=Y4œ=

@@ -1,1 +1,1 @@
-BprobabilitiesJ‚Ñ>Sq>Y0/>x¿(>Y¢Ñ=á3œ=
+BprobabilitiesJ„Ñ>’Sq>X0/>|¿(>U¢Ñ=à3œ=

@@ -1,1 +1,1 @@
-BprobabilitiesJP^o>ª$M>ãJ>Â»!>šÎç=*†Ç=
+BprobabilitiesJI^o>«$M>æJ>È»!>“Îç=1†Ç=

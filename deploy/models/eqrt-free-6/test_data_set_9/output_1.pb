@@ -1,1 +1,1 @@
-BprobabilitiesJÆ@„>Ö€>­àZ><>,Ÿ”=Š©<
+BprobabilitiesJÐ@„>Ñ€>¥àZ><>.Ÿ”=‡©<

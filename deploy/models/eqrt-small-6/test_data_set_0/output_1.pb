@@ -1,1 +1,1 @@
-BprobabilitiesJ'ÿq>QÖm>¨©:>¬p/>½=Q¯=
+BprobabilitiesJ!ÿq>MÖm>«©:>°p/>½=U¯=

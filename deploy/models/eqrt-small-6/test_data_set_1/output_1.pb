@@ -1,1 +1,1 @@
-BprobabilitiesJÿq>]Öm>ž©:>Íp/>M½=¯=
+BprobabilitiesJúþq>cÖm>Ÿ©:>Ðp/>M½= ¯=

@@ -1,1 +1,1 @@
-BprobabilitiesJ[çê>?Íâ>KæN>ô#>œhä=:(ú<
+BprobabilitiesJ◊çl>@d>ø<3>‹ñ)>2%	>C¿í=

@@ -1,1 +1,1 @@
-BprobabilitiesJÊ>oð‰>_²M>(i&>«a‰=‹š<
+BprobabilitiesJ½l>õd>—<3>=—)>&%	>žÀ’=

@@ -1,1 +1,1 @@
-BprobabilitiesJÕê>qâ>]≤M>)i&>ôaâ=Åö<
+BprobabilitiesJ[çê>>Íâ>OæN>ô#>œhä=@(ú<

@@ -1,1 +1,1 @@
-BprobabilitiesJxrc>iW>1a=>ÁÉ->˚Æ>… õ=
+BprobabilitiesJ ê>oâ>[≤M>)i&>ßaâ=èö<

@@ -1,1 +1,1 @@
-BprobabilitiesJ¦¾Z>”úM>´sK>Â%>°>k*¾=
+BprobabilitiesJÉ>tð‰>^²M>+i&>™a‰=Šš<

@@ -1,1 +1,1 @@
-BprobabilitiesJ™¾Z>§úM>ËsK>­%>2°>.*¾=
+BprobabilitiesJxrc>iW>2a=>ëƒ->ú®>Í ›=

@@ -1,1 +1,1 @@
-BprobabilitiesJBo>wk>5a5>Ëî4>¯ÐÉ=åK¬=
+BprobabilitiesJ¥¾Z>”úM>µsK>Â%>°>q*¾=

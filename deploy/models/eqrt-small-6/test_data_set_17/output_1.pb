@@ -1,1 +1,1 @@
-BprobabilitiesJT¹t>ql>C¯G>'ç$>¶"´=±[°=
+BprobabilitiesJœ¾Z>£úM>ËsK>«%>3°>+*¾=

@@ -1,1 +1,1 @@
-BprobabilitiesJ&Vk>õad>é2>˚r/>$'Ì=BX∞=
+BprobabilitiesJ>èo>tk>2a5>ÃÓ4>≠–…=ÁK¨=

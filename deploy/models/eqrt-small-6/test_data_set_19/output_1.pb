@@ -1,1 +1,1 @@
-BprobabilitiesJÆp„>'~>’*A>ý#>»Ùš=ÔŒ=
+BprobabilitiesJR¹t>ql>D¯G>&ç$>¸"´=³[°=

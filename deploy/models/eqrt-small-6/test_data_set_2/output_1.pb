@@ -1,1 +1,1 @@
-BprobabilitiesJ0ÿq>¾Öm>ˆ©:>Äp/>½=z¯=
+BprobabilitiesJ,ÿq>ÆÖm>ˆ©:>Åp/>½=s¯=

@@ -1,1 +1,1 @@
-BprobabilitiesJ±@q>aÄk>ÛG:>+÷/>Ý”Æ=îâª=
+BprobabilitiesJ+Vk>›ad>‹2>ür/>$'í=EX°=

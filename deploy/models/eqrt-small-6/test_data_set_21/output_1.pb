@@ -1,1 +1,1 @@
-BprobabilitiesJÆp„>'~>’*A>ý#>»Ùš=ÔŒ=
+BprobabilitiesJÃp„>*~>—*A>¢ý#>¶Ùš=€ÔŒ=

@@ -1,1 +1,1 @@
-BprobabilitiesJУ_u>йgZ>еrL>O[>S┤>х┘n=
+BprobabilitiesJ▒@q>a─k>█G:>/ў/>▀Ф╞=ьтк=

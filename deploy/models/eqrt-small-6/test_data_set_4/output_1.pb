@@ -1,1 +1,1 @@
-BprobabilitiesJG¬~>©ÈO>cˆC>²0->9•ð=¶‘=
+BprobabilitiesJG¬~>“ÈO>pˆC>Á0->2•ð=¸‘=

@@ -1,1 +1,1 @@
-BprobabilitiesJ#ÒS>ð³O>ëš<>e>.>¬—Ò=
+BprobabilitiesJ'ÒS>ï³O>ãš<>e>!.>¯—Ò=

@@ -1,1 +1,1 @@
-BprobabilitiesJd…c>Å‰_>C>'>‡˜>FWŽ=
+BprobabilitiesJb…c>Ë‰_>C>‹'>†˜>FWŽ=

@@ -1,1 +1,1 @@
-BprobabilitiesJ^…c>·‰_>:C>m'>¡˜>KWŽ=
+BprobabilitiesJa…c>»‰_>5C>j'>¡˜>OWŽ=

@@ -1,1 +1,1 @@
-BprobabilitiesJ‚žr>\-m>8.:>o/>}5»=Gø±=
+BprobabilitiesJ~žr>[-m>7.:>o/>x5»=Bø±=

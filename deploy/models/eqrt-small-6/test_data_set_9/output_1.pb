@@ -1,1 +1,1 @@
-BprobabilitiesJ“½‹>yØˆ>ŒDA>®ö!>©²¬=Èúé<
+BprobabilitiesJ“½‹>|Øˆ>DA>©ö!>¥²¬=Ëúé<

@@ -1,1 +1,1 @@
-BtrajectoriesJðO)ØÃÒUUC,yØÃÿ^VCyÉØÃ1hWCjÙÃIqXC"lÙÃ/zYC·¾ÙÃÍ‚ZC3ÚÃ‹[C˜fÚÃí’\Cà»ÚÃTš]CÛÃ<¡^CöhÛÃž§_C¬ÀÛÃq­`CÜÃ±²aC,rÜÃX·bCâËÜÃd»cC1&ÝÃÓ¾dCÝÃ¢ÁeCŠÜÝÃÔÃfC‘8ÞÃjÅgC+•ÞÃhÆhCZòÞÃÕÆiC PßÃºÆjC}®ßÃ$ÆkCnàÃ#ÅlCìlàÃÍÃmCèÌàÃ<ÂnCH-áÃÀoCéáÃò¾pC—îáÃ“½qCOâÃ¨¼rC
+BtrajectoriesJð'ØÃGUUCwuØÃô]VCæÄØÃ•fWC?ÙÃ÷nXCwfÙÃóvYC…¸ÙÃh~ZCdÚÃ?…[C_ÚÃe‹\C„³ÚÃË]C¿ÛÃg•^C½^ÛÃ2™_C{µÛÃ'œ`CõÜÃAžaC'eÜÃ~ŸbC¾ÜÃÛŸcC™ÝÃUŸdCÉqÝÃìeC”ÌÝÃŸ›fCï'ÞÃk˜gCÑƒÞÃS”hC0àÞÃWiC=ßÃ|‰jCBšßÃÈ‚kCæ÷ßÃF{lCîUàÃsmCV´àÃjnC%áÃž`oCcráÃºVpCÒáÃ›LqCp2âÃ|BrC

@@ -1,0 +1,1 @@
+BprobabilitiesJ¾Sg>® a>(}B>3ÿ#>lø=v²¨=

@@ -1,0 +1,1 @@
+BprobabilitiesJü–>3ët>qC>áe>žzÇ=nˆŽ=

@@ -1,0 +1,1 @@
+BprobabilitiesJ_u>§gZ>ªrL>T[>Q´>èÙn=

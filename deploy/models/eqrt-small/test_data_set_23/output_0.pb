@@ -1,0 +1,1 @@
+BtrajectoriesJðrMš?sX=­@GÔ=¢ùg@ÚTË=d¿š@"v>¨ƒÁ@;I#>&Gè@0eF>™„A2vm><åAŠZŒ>AF.AË¤>±¨AAÕˆ½>©UAo°Ø>7vhAb6õ>Cã{Apl	?¾ª‡A¯?¦f‘AçL(?k%›AÎ78?øæ¤AÊjH?«®AßéX?—q¸A$Ái?:ÂA{?mÌA÷b†?nÐÕA&?3žßAc™?,néAuî¢??AóA•!­?çýAž·?²{B,GÂ?îoBníÌ?OkB\I×?›pB¨öà?
