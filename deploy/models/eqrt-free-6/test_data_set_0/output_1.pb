@@ -1,2 +1,1 @@
-BprobabilitiesJ:ff>ทL>
-๗G>ุ‘!>ํๆ=sแ=
+BprobabilitiesJํy>ดv>ย่V>'ื>ฉ๋๛=ป-=

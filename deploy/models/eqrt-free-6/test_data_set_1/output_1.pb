@@ -1,1 +1,1 @@
-BprobabilitiesJff>AL>ЭўG>hС!>Ъц=WЕс=
+BprobabilitiesJyэy>єv>kшV>Ы╫>Ўъ√=K-=

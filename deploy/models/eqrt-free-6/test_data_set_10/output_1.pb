@@ -1,1 +1,1 @@
-BprobabilitiesJ≥èc>ˇÃa>Ê¬P>_)>£&>v”<
+BprobabilitiesJ=¶H>: C>Ôî=>µ2>#>v•Â=

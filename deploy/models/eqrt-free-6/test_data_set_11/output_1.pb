@@ -1,1 +1,1 @@
-BprobabilitiesJ╓▐c>3мa>ыбP>У^)>▐&>Nvс<
+BprobabilitiesJX╕H>#йC>}■=>~2>В>'╖Е=

@@ -1,1 +1,1 @@
-BprobabilitiesJ†>õv>¼Wo>úQ<>}z=O"<
+BprobabilitiesJŠƒ> Í~>:¿g>É(D>ð†=êœ2<

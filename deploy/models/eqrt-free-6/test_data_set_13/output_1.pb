@@ -1,1 +1,1 @@
-BprobabilitiesJœê†>¨‚~>àr>ñP:>u=hä <
+BprobabilitiesJ<ü‚>ï~>3_g>¸ÞD>ÿM‡=13<

@@ -1,1 +1,1 @@
-BprobabilitiesJ¡ê†>ª‚~>är>ðP:>éu=Zä <
+BprobabilitiesJ4ü‚>ï~>._g>ÁÞD>N‡=13<

@@ -1,1 +1,2 @@
-BprobabilitiesJ¿n>Hm`>#2?>Ω∂)>P—¯=Yó=
+BprobabilitiesJ$
+k>oSd>x•Q>ª¿&>ø€Ù=g9w=

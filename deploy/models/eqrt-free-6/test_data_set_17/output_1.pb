@@ -1,1 +1,2 @@
-BprobabilitiesJLÀn>Ýl`>~1?>·)>óÏø=œ—=
+BprobabilitiesJk
+k>ZSd>#¥Q>4Á&>ˆÚô=i:w=

@@ -1,1 +1,1 @@
-BprobabilitiesJ^±q>ün>–±=>¨∑*>ËK÷=@ò=
+BprobabilitiesJ¡Nu>Üßp>vZQ>u2>+ﬂ=.ùk=

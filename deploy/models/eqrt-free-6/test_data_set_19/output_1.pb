@@ -1,1 +1,1 @@
-BprobabilitiesJ°CT>3Q>ñB>Ÿ+>oæ>€ÿ°=
+BprobabilitiesJ¤€>Û£s>P‘[>O•>/–Î=ªä2=

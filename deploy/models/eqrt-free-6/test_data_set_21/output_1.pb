@@ -1,1 +1,1 @@
-BprobabilitiesJ¾Sg>® a>(}B>3ÿ#>lø=v²¨=
+BprobabilitiesJ£ƒ>a>sY>H7>ûÅæ=›)=

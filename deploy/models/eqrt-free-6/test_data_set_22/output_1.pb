@@ -1,1 +1,1 @@
-BprobabilitiesJ}Æe>Ã€b>Ÿ\C>^Q$>ï!>Ñ•=
+BprobabilitiesJå‚ˆ>µ+{>ïF[>Õ>ö=‰cÕ<

@@ -1,1 +1,1 @@
-BprobabilitiesJ¸ñÅ>3Ît>qC>·e>ûz«=nàé=
+BprobabilitiesJ¶1{>4r>÷2+>v˛*>4a€=—pù=

@@ -1,1 +1,1 @@
-BprobabilitiesJb‹>+yB>[ÍA>†F>2æ=t+·=
+BprobabilitiesJ€„>ÝÉD>äd4>11> mã=|Ø¶=

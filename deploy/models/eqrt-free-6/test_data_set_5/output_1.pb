@@ -1,1 +1,1 @@
-BprobabilitiesJYÜC>ž„@>GŸ;>Ñ()>³ÿ>ƒ®÷=
+BprobabilitiesJód>ðð\>³òH>@¬>ßÐ>‘&¯=

@@ -1,1 +1,1 @@
-BprobabilitiesJvÑ>oSq>I0/>k¿(>y¢Ñ=Y4œ=
+BprobabilitiesJôp>ì?>‹|>>y­4>kñ÷=Ž´Á=

@@ -1,1 +1,1 @@
-BprobabilitiesJ„Ñ>’Sq>X0/>|¿(>U¢Ñ=à3œ=
+BprobabilitiesJÏp>ì?>^|>>¹­4>ñ÷=µÁ=

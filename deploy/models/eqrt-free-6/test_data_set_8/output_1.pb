@@ -1,1 +1,1 @@
-BprobabilitiesJI^o>«$M>æJ>È»!>“Îç=1†Ç=
+BprobabilitiesJ4¤€>—€>)º=>*ü#>ÌJ¹=j·|=

@@ -1,1 +1,1 @@
-BprobabilitiesJÐ@„>Ñ€>¥àZ><>.Ÿ”=‡©<
+BprobabilitiesJ¡*>Ír>ç…L>¡Ð>»Þ=Ì<
