@@ -96,10 +96,10 @@ class CompactPredictor(nn.Module):
         tokens = self.norm(torch.cat([self.agent(seen.agents), self.lane(seen.lanes)], 1))
         drawn = self.modes(tokens, seen.valid)
         with exact(history):
-            course = seen.velocity.unsqueeze(1) @ drawn.share.to(seen.velocity)  # (B, K, 2, 1)
-            shape = drawn.shape.to(course) @ seen.turn.unsqueeze(1)  # (B, K, BASIS, 2)
-            path = self.modes.basis @ torch.cat([course.transpose(-1, -2), shape], -2)
-            covariances = [tile_covariances(factor, seen.turn) for factor in drawn.factors]
+            course = drawn.share.to(seen.velocity) @ seen.velocity.transpose(1, 2)  # (B, K, 2)
+            shape = (drawn.shape.to(course) @ seen.turn).unflatten(1, (-1, BASIS))
+            path = self.modes.basis @ torch.cat([course.unsqueeze(2), shape], 2)
+            covariances = [tile_covariances(spread, seen.turn) for spread in drawn.spreads]
             return seen.origin + path, drawn.probabilities, *covariances
 
 
@@ -130,11 +130,11 @@ class Drawn:
     probabilities: Tensor
     """(B, K)"""
     share: Tensor
-    """(B, K, S, 1) of each fitted velocity in the mode's course."""
+    """(B, K, S) of each fitted velocity in the mode's course."""
     shape: Tensor
-    """(B, K, BASIS, 2) how the mode leaves its course, in the target's frame."""
-    factors: tuple[Tensor, ...]
-    """With uncertainty, (B, K, H, 2, 2) of `spread`, in the target's frame; else empty."""
+    """(B, K BASIS, 2) how the mode leaves its course, in the target's frame."""
+    spreads: tuple[Tensor, ...]
+    """With uncertainty, (B, K, 3, H) of `spread`, in the target's frame; else empty."""
 
 
 class ModeDecoder(nn.Module):
@@ -171,34 +171,27 @@ class ModeDecoder(nn.Module):
         queries = (tokens[:, :1] + self.query).flatten(0, 1)  # (B K, W)
         for layer in self.layers:
             queries = layer(queries, tokens, columns, hidden)
-        queries = self.norm(queries)
+        probabilities, queries = self._most_probable_first(self.norm(queries))
         shape, share = self.draw(queries).split([2 * BASIS, len(SLOPE_STEPS)], -1)
-        factors = () if self.spread is None else (self.spread(self._by_mode(queries)),)
-        return self._sorted(
-            queries,
-            share.softmax(-1).view(-1, self.num_modes, len(SLOPE_STEPS), 1),
-            shape.reshape(-1, self.num_modes, BASIS, 2),
-            factors,
+        return Drawn(
+            probabilities,
+            self._by_mode(share.softmax(-1)),
+            shape.reshape(-1, self.num_modes * BASIS, 2),
+            () if self.spread is None else (self.spread(self._by_mode(queries)),),
         )
 
     def _by_mode(self, values: Tensor) -> Tensor:
         """(B K, F) -> (B, K, F)."""
         return values.view(-1, self.num_modes, values.shape[-1])
 
-    def _sorted(
-        self, queries: Tensor, share: Tensor, shape: Tensor, factors: tuple[Tensor, ...]
-    ) -> Drawn:
+    def _most_probable_first(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """Probabilities (B, K), and the queries (B K, W) in their order."""
         if self.logit is None:
-            certain = queries[:, :1].softmax(-1)  # of one: 1
-            return Drawn(certain, share, shape, factors)
+            return queries[:, :1].softmax(-1), queries  # of one: 1
         logits = self._by_mode(self.logit(queries)).squeeze(-1)
         probabilities, order = logits.softmax(-1).topk(self.num_modes, dim=-1)
-
-        def sort(values: Tensor) -> Tensor:
-            places = order.view(*order.shape, *[1] * (values.dim() - 2))
-            return values.gather(1, places.expand(-1, -1, *values.shape[2:]))
-
-        return Drawn(probabilities, sort(share), sort(shape), tuple(map(sort, factors)))
+        places = order.unsqueeze(-1).expand(-1, -1, queries.shape[-1])
+        return probabilities, self._by_mode(queries).gather(1, places).flatten(0, 1)
 
 
 class ModeLayer(nn.Module):

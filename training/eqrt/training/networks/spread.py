@@ -32,7 +32,7 @@ It bounds how thin an ellipse can be: float32 still knows the area of one of 1 :
 
 
 class SpreadDecoder(nn.Module):
-    """Draws a factor per mode and step."""
+    """Draws a shape per mode and step."""
 
     start: Tensor
     """(H,) metres, what training starts from."""
@@ -50,29 +50,42 @@ class SpreadDecoder(nn.Module):
         self.register_buffer("basis", time_basis(steps) / (count / steps), persistent=False)
 
     def forward(self, queries: Tensor) -> Tensor:
-        """Modes (B, K, W) -> factors (B, K, H, 2, 2) in metres, in the target's frame."""
+        """Modes (B, K, W) -> (B, K, 3, H): S_xx, S_xy, S_yy, square metres, target's frame."""
         drawn = self.draw(queries).to(self.start.dtype).unflatten(-1, (3, BASIS))
         with exact(queries):
-            along, across, both = (drawn @ self.basis).unbind(-2)  # (B, K, H) each
+            scales, skew = torch.split(drawn @ self.basis, [2, 1], -2)  # (B, K, 2, H), (B, K, 1, H)
             limit = math.log(RANGE)
-            a = FLOOR_M + self.start * along.clamp(-limit, limit).exp()
-            b = FLOOR_M + self.start * across.clamp(-limit, limit).exp()
-            c = self.start * both.clamp(-RANGE, RANGE)
-            rows = [torch.stack([a, torch.zeros_like(a)], -1), torch.stack([c, b], -1)]
-            return torch.stack(rows, -2)
+            scales = FLOOR_M + self.start * scales.clamp(-limit, limit).exp()
+            a, b = torch.split(scales, 1, -2)
+            c = self.start * skew.clamp(-RANGE, RANGE)
+            return torch.cat([a * a, a * c, b * b + c * c], -2)
 
 
-def tile_covariances(factor: Tensor, turn: Tensor) -> Tensor:
+def tile_covariances(shape: Tensor, turn: Tensor) -> Tensor:
     """Covariances (B, K, H, 2, 2), square metres, in the tile's axes.
 
-    Of factors (B, K, H, 2, 2) in the target's frame, which `turn` (B, 2, 2) turns columns into. A
+    Of shapes (B, K, 3, H) in the target's frame, which `turn` (B, 2, 2) turns columns into. A
     target without any direction has the zero matrix there: its spread is a circle, the
     only shape that is the same whichever way the world is turned.
     """
-    turned = turn.transpose(-1, -2)[:, None, None] @ factor
-    shape = turned @ turned.transpose(-1, -2)
-    direction2 = turn[:, 0].square().sum(-1)  # (B,) 1, or 0 without any
-    missing = (1.0 - direction2).clamp(min=0.0)[:, None, None]
-    mean = 0.5 * missing * factor.square().sum((-1, -2))  # (B, K, H)
-    circle = mean[..., None, None] * torch.eye(2, dtype=factor.dtype, device=factor.device)
-    return COVARIANCE_OF_SHAPE * (shape + circle)
+    heading = turn[:, 0]  # (B, 2)
+    products = (heading.unsqueeze(2) * heading.unsqueeze(1)).flatten(1)  # (B, 4)
+    turned = products @ turn.new_tensor(_TURNED) + turn.new_tensor(_CIRCLE)
+    entries = shape.transpose(-1, -2) @ turned.view(-1, 1, 3, 4)  # (B, K, H, 4)
+    return entries.view(-1, shape.shape[1], shape.shape[3], 2, 2)
+
+
+def _turned() -> Tensor:
+    """(4, 12) what products (xx, xy, yx, yy) of the heading make of S_xx, S_xy, S_yy (rows of 4).
+
+    S lies along u = (x, y) and across v = (-y, x): S_xx u u' + S_xy (u v' + v u') + S_yy v v'. What
+    the heading is short of length 1 goes to a circle of as large a trace.
+    """
+    xx, xy, _, yy = torch.eye(4)
+    less = -0.5 * (xx + yy)
+    along, across = [xx + less, xy, xy, yy + less], [yy + less, -xy, -xy, xx + less]
+    return torch.stack([*along, -2 * xy, xx - yy, xx - yy, 2 * xy, *across], 1)
+
+
+_TURNED = (COVARIANCE_OF_SHAPE * _turned()).tolist()
+_CIRCLE = [0.5 * COVARIANCE_OF_SHAPE * of for of in (1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 1)]
