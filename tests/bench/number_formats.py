@@ -2,9 +2,10 @@
 
     python tests/bench/number_formats.py [ARTIFACT]
 
-The artifact's own test vectors, with weights as float32, as float16 (stored, computed in float32:
-onnxruntime has no float16 products on CPUs) and as int8 (onnxruntime's dynamic quantization, which
-quantizes activations as it goes). Needs the workstation's environment, and wants a quiet machine.
+The artifact's own test vectors, with learned weights as float32, as float16 and bfloat16 (stored,
+computed in float32: onnxruntime has no such products on CPUs) and as int8: "dynamic" scales to what
+each run's tensors hold, "static" to what all test vectors showed. Positions, masks and frames stay
+float32. Needs the workstation's environment, and wants a quiet machine.
 """
 
 from __future__ import annotations
@@ -13,13 +14,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
-from onnxruntime.quantization import QuantType, quantize_dynamic
+from onnxruntime.quantization import (
+    CalibrationDataReader,
+    QuantFormat,
+    QuantType,
+    quantize_dynamic,
+    quantize_static,
+)
 
 from eqrt.core.contract import ModelContract
 from eqrt.core.frames import Pose2
@@ -31,6 +39,8 @@ from eqrt.runtime.prediction.stored_vectors import read_vector, vector_folders
 BATCHES = (1, 32)
 TURNS, RUNS = 7, 60
 """Formats take turns, each turn a median of so many runs: what disturbs one disturbs all."""
+_FORMS = ("", "_MatMul")
+"""What onnxruntime calls a Gemm that it has taken apart before quantizing."""
 LARGE = 1_000
 """Smaller constants are masks and time steps; their size does not matter, their values do."""
 
@@ -82,36 +92,79 @@ def as_it_is(folder: Path, scratch: Path) -> Path:
     return file
 
 
-def half_weights(folder: Path, scratch: Path) -> Path:
-    """Large weights stored as float16, cast when the session starts."""
+def half_weights(folder: Path, scratch: Path, kind: int) -> Path:
+    """Large weights stored as `kind`, cast when the session starts."""
     model = onnx.load(folder / "model.onnx")
     graph = model.graph
     for tensor in [tensor for tensor in graph.initializer if np.prod(tensor.dims) > LARGE]:
-        half = onnx.numpy_helper.to_array(tensor).astype(np.float16)
+        values = onnx.numpy_helper.to_array(tensor)
+        half = values.astype(onnx.helper.tensor_dtype_to_np_dtype(kind))
         graph.initializer.remove(tensor)
         stored = f"{tensor.name}_half"
         graph.initializer.append(onnx.numpy_helper.from_array(half, stored))
         cast = onnx.helper.make_node("Cast", [stored], [tensor.name], to=onnx.TensorProto.FLOAT)
         graph.node.insert(0, cast)
-    onnx.save(model, scratch / "float16.onnx")
-    return scratch / "float16.onnx"
+    file = scratch / f"{kind}.onnx"
+    onnx.save(model, file)
+    return file
 
 
-def int8_weights(folder: Path, scratch: Path) -> Path:
+def learned_products(folder: Path) -> list[str]:
+    """The nodes that multiply with large weights: what may be quantized."""
+    graph = onnx.load(folder / "model.onnx").graph
+    large = {tensor.name for tensor in graph.initializer if np.prod(tensor.dims) > LARGE}
+    return [
+        node.name
+        for node in graph.node
+        if node.op_type in ("MatMul", "Gemm") and large & set(node.input)
+    ]
+
+
+def dynamic_int8(folder: Path, scratch: Path) -> Path:
     """Products of int8, scaled to what each run's tensors hold."""
+    file = scratch / "dynamic.onnx"
     quantize_dynamic(
         folder / "model.onnx",
-        scratch / "int8.onnx",
+        file,
         weight_type=QuantType.QInt8,
-        op_types_to_quantize=["MatMul", "Gemm"],
+        nodes_to_quantize=[f"{name}{form}" for name in learned_products(folder) for form in _FORMS],
     )
-    return scratch / "int8.onnx"
+    return file
+
+
+class Vectors(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types
+    """The artifact's test vectors, one after the other."""
+
+    def __init__(self, folder: Path) -> None:
+        self._left = [scene.inputs() for scene in named_vectors(folder).values()]
+
+    def get_next(self) -> Mapping[str, np.ndarray] | None:
+        """None after the last."""
+        return self._left.pop() if self._left else None
+
+
+def static_int8(folder: Path, scratch: Path) -> Path:
+    """Products of int8, scaled to what the test vectors showed."""
+    file = scratch / "static.onnx"
+    quantize_static(
+        folder / "model.onnx",
+        file,
+        Vectors(folder),
+        quant_format=QuantFormat.QDQ,
+        per_channel=True,
+        activation_type=QuantType.QUInt8,
+        weight_type=QuantType.QInt8,
+        nodes_to_quantize=learned_products(folder),
+    )
+    return file
 
 
 FORMATS: Mapping[str, Callable[[Path, Path], Path]] = {
     "float32": as_it_is,
-    "float16": half_weights,
-    "int8": int8_weights,
+    "float16": partial(half_weights, kind=onnx.TensorProto.FLOAT16),
+    "bfloat16": partial(half_weights, kind=onnx.TensorProto.BFLOAT16),
+    "dynamic int8": dynamic_int8,
+    "static int8": static_int8,
 }
 
 
@@ -167,7 +220,7 @@ def _cases() -> list[tuple[str, int]]:
 
 def _row(*cells: str) -> str:
     first, *others = cells
-    return first.ljust(10) + "".join(cell.rjust(16) for cell in others)
+    return first.ljust(14) + "".join(cell.rjust(16) for cell in others)
 
 
 if __name__ == "__main__":

@@ -285,11 +285,11 @@ def test_a_damaged_artifact_is_refused_with_a_reason(
 
 
 def test_no_flipped_bit_is_accepted(tmp_path: Path) -> None:
-    """200 at random places of the shipped artifact: half in the model, half in anything else."""
+    """1,000 at random places of the shipped artifact: half in the model, half in anything else."""
     folder = Path(shutil.copytree(DEFAULT_ARTIFACT, tmp_path / "copy"))
     rng = np.random.default_rng(12)
     others = sorted(path for path in folder.rglob("*") if path.is_file())
-    for trial in range(200):
+    for trial in range(1_000):
         path = folder / "model.onnx" if trial % 2 else others[rng.integers(len(others))]
         at, bit = int(rng.integers(path.stat().st_size)), int(rng.integers(8))
         flip(path, at, bit)

@@ -95,7 +95,7 @@ class LaneDirection(nn.Module):
 
 
 def heading_vector(moved: Tensor, heading: Tensor, lane: Tensor) -> Tensor:
-    """The unit heading (B, 2) of the targets; (0, 0) where nothing defines one.
+    """The heading (B, 2) of the targets: of length 1 or less, (0, 0) where nothing defines one.
 
     moved (B, 2): displacement over the last second, metres. heading (B, 2): measured, or 0. lane
     (B, 2): `LaneDirection`.

@@ -24,7 +24,7 @@ class LstmConfig:
     """Table [network] with kind = "lstm"."""
 
     hidden: BoundedCount
-    """BoundedCount of the LSTM, of the features and of the perceptrons."""
+    """Width of the LSTM, of the features and of the perceptrons."""
     mlp_layers: BoundedCount
     """Layers of every perceptron."""
     image_pixels: Pixels

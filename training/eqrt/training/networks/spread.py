@@ -66,7 +66,8 @@ def tile_covariances(shape: Tensor, turn: Tensor) -> Tensor:
 
     Of shapes (B, K, 3, H) in the target's frame, which `turn` (B, 2, 2) turns columns into. A
     target without any direction has the zero matrix there: its spread is a circle, the
-    only shape that is the same whichever way the world is turned.
+    only shape that is the same whichever way the world is turned. One whose sources contradict each
+    other (`canonical.heading_vector`) has something in between.
     """
     heading = turn[:, 0]  # (B, 2)
     products = (heading.unsqueeze(2) * heading.unsqueeze(1)).flatten(1)  # (B, 4)
@@ -88,4 +89,4 @@ def _turned() -> Tensor:
 
 
 _TURNED = (COVARIANCE_OF_SHAPE * _turned()).tolist()
-_CIRCLE = [0.5 * COVARIANCE_OF_SHAPE * of for of in (1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 1)]
+_CIRCLE = [0.5 * COVARIANCE_OF_SHAPE * one for one in (1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 1)]

@@ -37,7 +37,8 @@ class Seen:
     origin: Tensor
     """(B, 1, 1, 2) the target now, metres, tile frame."""
     turn: Tensor
-    """(B, 2, 2) turns columns into the target's frame, so rows of it back into the tile's axes."""
+    """(B, 2, 2) turns columns into the target's frame, so rows of it back into the tile's axes; a
+    fraction of that where the sources of its heading contradict each other (`heading_vector`)."""
     velocity: Tensor
     """(B, 2, S) the target's fitted velocities, m/s, tile's axes."""
 
