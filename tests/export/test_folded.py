@@ -117,7 +117,8 @@ def test_points_are_averaged_under_exact_attention(spread: float) -> None:
     """Over more queries than are taken at a time, and with scores of any size."""
     torch.manual_seed(3)
     query, key = torch.randn(2, 2 * 5, 3).double().unbind(0)
-    points, valid = spread * torch.randn(2, 130, 2).double(), torch.rand(2, 130) < 0.8
+    valid = torch.rand(2, 130) < 0.8
+    points = spread * torch.randn(2, 130, 2).double() * valid.unsqueeze(-1)
     means = PointMeans(query, key, 2, points)
     columns = torch.cat([points.transpose(1, 2), torch.ones(2, 1, 130).double()], 1)
     found = means(columns, valid.unsqueeze(1))  # (B, 4, P): x of both heads, then y
@@ -161,3 +162,38 @@ def test_a_layer_is_a_hundred_cheap_operators_all_of_the_standard() -> None:
     assert layer["", "Gemm"] + layer["", "MatMul"] <= 26
     expensive = {"ReduceSum", "ReduceMean", "Expand", "Where", "Gather", "Concat", "Pow"}
     assert not expensive & {kind for _, kind in layer}
+
+
+@pytest.mark.parametrize("heads", [1, 6])
+def test_no_share_of_attention_is_too_small_for_a_normal_float(heads: int) -> None:
+    """For an exponential that is, an x86 processor may take a hundred times as long."""
+    torch.manual_seed(5)
+    encoder = FoldedTransformer(TransformerEncoder(40, 12, heads, [8, 8]))
+    shares: list[Tensor] = []
+    softmax = Tensor.softmax
+
+    def noted(scores: Tensor, dim: int) -> Tensor:
+        shares.append(softmax(scores, dim))
+        return shares[-1]
+
+    valid = torch.arange(40) < torch.tensor([[40], [7], [1], [0]])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Tensor, "softmax", noted)
+        encoder(3.0 * torch.randn(4, 40, 2) * valid.unsqueeze(-1), valid)
+    assert shares
+    assert min(share.min() for share in shares) >= torch.finfo(torch.float32).tiny
+
+
+def test_points_that_do_not_exist_weigh_nothing() -> None:
+    torch.manual_seed(6)
+    few = torch.randn(1, 9, 2).double()
+    padded = torch.cat([few, torch.zeros(1, 900, 2).double()], 1)
+    means = PointMeans(*torch.randn(2, 2 * 5, 3).double().unbind(0), 2, few)
+
+    def found(points: Tensor) -> Tensor:
+        valid = torch.arange(points.shape[1]) < 9
+        ones = torch.ones(1, 1, points.shape[1]).double()
+        seen: Tensor = means(torch.cat([points.mT, ones], 1), valid.view(1, 1, -1))
+        return seen[..., :9]
+
+    torch.testing.assert_close(found(padded), found(few), atol=1e-13, rtol=0)

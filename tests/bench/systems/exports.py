@@ -2,7 +2,7 @@
 
     python -m bench.systems.exports NAME CONFIGS FOLDER
 
-Weights are random, with a fixed seed: no operator here takes longer or shorter for their values.
+Weights are random, with a fixed seed: trained ones take as long.
 NAME is a configuration in CONFIGS, exported as `eqrt export` does it; with `, naive`
 behind it, as `torch.onnx.export` alone does it: the network as it was trained, by PyTorch's own
 exporter with its own settings, and nothing done to the graph afterwards. Both files keep the

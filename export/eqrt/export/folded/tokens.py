@@ -19,7 +19,8 @@ from eqrt.training.networks.map_tokens import AttentionEncoder, TransformerEncod
 
 QUERIES = 200
 """Taken at a time: with 1,000 points their scores are 800 kB."""
-_MASKED = -1e9  # as in map_tokens
+_UNSEEN = -40.0
+"""Added to the score of a point that does not exist. e^-40 is nothing beside 1, in any float."""
 
 
 def folded_map(encoder: nn.Module) -> nn.Module:
@@ -45,14 +46,13 @@ class PointMeans(Fixed):
         self.keep(ask=torch.cat([score[..., :2], mask.view(1, 3, 1).expand(heads, 3, 1)], 2))
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
-        """Points (B, 3, P), the last coordinate 1, valid (B, 1, P) -> (B, 2 heads, P).
+        """Points (B, 3, P), 0 where not valid (B, 1, P) but for the last coordinate, which is 1.
 
-        First every head's x, then every head's y.
+        Means (B, 2 heads, P): first every head's x, then every head's y.
         """
         ask, count = self.get_buffer("ask"), points.shape[2]
         queries = (points.unsqueeze(1).transpose(2, 3) @ ask).flatten(1, 2)  # (B, heads P, 3)
-        hidden = torch.where(valid, 0.0, _MASKED).to(points.dtype)
-        keys = torch.cat([points[:, :2], hidden], 1)
+        keys = _only_existing(points, valid.to(points.dtype))
         x, y = points[:, 0].unsqueeze(2), points[:, 1].unsqueeze(2)  # (B, P, 1)
         means: tuple[list[Tensor], list[Tensor]] = ([], [])
         for some in torch.split(queries, QUERIES, 1):
@@ -141,6 +141,19 @@ class FoldedTransformer(Fixed):
         tokens = torch.addmm(token, wide, of("narrow"))
         shape = of("scale").shape
         return functional.layer_norm(tokens, shape, of("scale"), of("shift"), self.eps[1])
+
+
+def _only_existing(points: Tensor, valid: Tensor) -> Tensor:
+    """Keys (B, 3, P) of points (B, 3, P), 0 where not valid (B, 1, P), and the last coordinate 1.
+
+    What does not exist lies at the middle of what does, which no query prefers to all of that, and
+    counts e^-40 as much. Hidden by minus infinity, or -1e9, it would have an exponential too small
+    for a normal float, and some processors take a hundred times as long for one of these.
+    """
+    count = valid.sum(2, keepdim=True).clamp(min=1.0)
+    middle = (points @ valid.transpose(1, 2)) / count  # (B, 3, 1); of no points: 0
+    place = torch.cat([middle[:, :2], torch.full_like(count, _UNSEEN)], 1)
+    return torch.addcmul(points, place, 1.0 - valid)
 
 
 def with_ones(points: Tensor) -> Tensor:
