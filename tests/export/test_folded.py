@@ -188,7 +188,8 @@ def test_points_that_do_not_exist_weigh_nothing() -> None:
     torch.manual_seed(6)
     few = torch.randn(1, 9, 2).double()
     padded = torch.cat([few, torch.zeros(1, 900, 2).double()], 1)
-    means = PointMeans(*torch.randn(2, 2 * 5, 3).double().unbind(0), 2, few)
+    query, key = torch.randn(2, 2 * 5, 3).double().unbind(0)
+    means = PointMeans(query, key, 2, few)
 
     def found(points: Tensor) -> Tensor:
         valid = torch.arange(points.shape[1]) < 9
