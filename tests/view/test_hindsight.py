@@ -232,7 +232,7 @@ def test_cycles_that_did_not_come_whole_are_counted() -> None:
 
 
 def test_parts_of_different_cycles_make_no_cycle() -> None:
-    """Of two services at one address, or of one that started again within a cycle."""
+    """Of one service and of another that came after it."""
     here, there = ([part_of(p) for p in encode_datagrams(crowd(0, n))] for n in (200, 190))
     other_model = [replace(one, forecasts=replace(one.forecasts, model_id="other")) for one in here]
     joiner = Joiner()

@@ -22,6 +22,10 @@ class Joiner:
         self.lost_cycles = 0
         """Cycles of which nothing, or not everything, came."""
 
+    def begin_anew(self) -> None:
+        """Another service is heard from now on: what it has sent before is not lost."""
+        self._cycle = -1
+
     def add(self, datagram: Datagram) -> ForecastSet | None:
         """The whole cycle, if this was its last part."""
         cycle, whole = datagram.forecasts.cycle, _whole(datagram)
@@ -40,7 +44,7 @@ class Joiner:
 
 def _whole(datagram: Datagram) -> tuple[object, ...]:
     """What the parts of one cycle have in common. The count alone does not tell: a service that
-    starts again counts from 0, and two may send to one address.
+    starts again counts from 0.
     """
     said = datagram.forecasts
     sizes = (said.history.shape[1:], said.trajectories.shape[1:], said.covariances is None)
