@@ -166,7 +166,7 @@ def test_a_layer_is_a_hundred_cheap_operators_all_of_the_standard() -> None:
 
 @pytest.mark.parametrize("heads", [1, 6])
 def test_no_share_of_attention_is_too_small_for_a_normal_float(heads: int) -> None:
-    """For an exponential that is, an x86 processor may take a hundred times as long."""
+    """A softmax full of exponentials that are takes an Intel processor ten times as long."""
     torch.manual_seed(5)
     encoder = FoldedTransformer(TransformerEncoder(40, 12, heads, [8, 8]))
     shares: list[Tensor] = []

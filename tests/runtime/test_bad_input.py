@@ -168,7 +168,7 @@ CASES: list[tuple[str, int, str]] = [  # command line, status, what is said
     (
         "replay drive.mf4 --profile ars408 --out -",
         1,
-        r"drive\.mf4: unknown log format '\.mf4'; known",
+        r"drive\.mf4: unknown log format '\.mf4'; known are \.log, .*; from MF4",
     ),
     (
         "replay notes.log --profile ars408 --out -",

@@ -36,6 +36,12 @@ _MAX_DATA_BYTES, _MAX_ID, _MAX_EXTENDED_ID = 64, 0x7FF, 0x1FFFFFFF
 _MAX_TIME_S = 1e11  # the year 5138; a comparison that NaN and infinity fail as well
 _CUT_SHORT = (EOFError, zlib.error, gzip.BadGzipFile)
 _SAYS_NOTHING = ("end triggerblock", "//", ";")  # last lines of .asc and .trc without a message
+# Not read by itself: python-can's reader imports asammdf, and with it pandas, wherever both are
+# installed, so that every command would start later.
+_FROM_MDF = (
+    "from MF4 make one with can_logconvert, which `pip install 'python-can[mf4]'` brings into an "
+    "environment of its own"
+)
 
 
 class LogReader:
@@ -121,7 +127,10 @@ def read_log(path: str | Path) -> LogReader:
     suffix = Path(path.name.lower().removesuffix(".gz")).suffix
     if suffix not in FORMATS:
         known = ", ".join(FORMATS)
-        raise LogError(f"{path}: unknown log format {suffix!r}; known are {known} (also with .gz)")
+        convert = f"; {_FROM_MDF}" if suffix == ".mf4" else ""
+        raise LogError(
+            f"{path}: unknown log format {suffix!r}; known are {known} (also with .gz){convert}"
+        )
     return LogReader(path, FORMATS[suffix])
 
 
