@@ -26,6 +26,7 @@ from eqrt.runtime.bench.report import Case, Report, Settings, report_now
 from eqrt.runtime.bench.resources import Watch
 from eqrt.runtime.bench.scenes import ScenePool, record_scenes
 from eqrt.runtime.bench.schedule import CLOCK, Turn, back_to_back, periodic, ticks_in
+from eqrt.runtime.bench.slow_scenes import slow_scenes
 from eqrt.runtime.bench.table import case_lines, closing_lines, heading_lines
 from eqrt.runtime.bench.verdict import advice, alone_advice, reasons
 from eqrt.runtime.bench.workload import Workload
@@ -54,7 +55,10 @@ def bench_model(artifact: Path, settings: Settings, say: Say) -> Report:
         for targets in settings.targets:
             judged = ModelWorkload(predictor, pool, targets)
             loads: list[Workload] = [judged, *physics(predictor.contract, pool, targets)]
-            case = measure_case(targets, loads, settings, environment, should_stop)
+            recurring = len(pool) if targets == 1 else None
+            case = measure_case(
+                targets, loads, settings, environment, should_stop, recurring=recurring
+            )
             if case is None:
                 break
             cases.append(case)
@@ -90,8 +94,12 @@ def measure_case(
     should_stop: Callable[[], bool],
     *,
     rotating: bool = False,
+    recurring: int | None = None,
 ) -> Case | None:
-    """Warm up, measure, sum up; None if told to stop before the first turn."""
+    """Warm up, measure, sum up; None if told to stop before the first turn.
+
+    `recurring`: after so many runs their input comes again; None = never the same.
+    """
     turn_s = warm_up(loads)
     if should_stop():
         return None
@@ -111,6 +119,11 @@ def measure_case(
     resources = watch.finish()
     found = results(loads, measured)
     kept = None if settings.rate_hz is None else punctuality(measured, settings.rate_hz)
+    slow = (
+        ()
+        if recurring is None
+        else slow_scenes(measured.turns[:, 0], measured.stages_ns[0].sum(axis=1), recurring)
+    )
     return Case(
         targets=targets,
         seconds=round(seconds, 3),
@@ -120,7 +133,7 @@ def measure_case(
         reasons=reasons(
             settings, found[0], resources, seconds, clock_went_back=clock_went_back(measured)
         ),
-        advice=advice(settings, environment, found[0], kept, resources),
+        advice=(*advice(settings, environment, found[0], kept, resources), *slow),
     )
 
 
