@@ -53,3 +53,18 @@ def test_values_are_rounded_to_a_millimetre() -> None:
 def test_an_unknown_velocity_is_null() -> None:
     (line,) = json_lines(replace(one_car(), velocity=np.full((1, 2), np.nan))).splitlines()
     assert json.loads(line)["velocity"] == [None, None]
+
+
+def test_covariances_are_told_where_the_model_predicts_them() -> None:
+    forecasts = many(3)
+    roots = np.random.default_rng(1).uniform(0.1, 2.0, (*forecasts.trajectories.shape, 2))
+    spread = roots @ roots.mT
+    spread[1] = np.nan  # of a target that physics predicts
+    lines = json_lines(replace(forecasts, covariances=spread)).splitlines()
+    first, second, third = (json.loads(line)["covariances"] for line in lines)
+    assert second is None
+    for told, true in ((first, spread[0]), (third, spread[2])):
+        halves = np.stack([true[..., 0, 0], true[..., 0, 1], true[..., 1, 1]], -1)
+        np.testing.assert_allclose(np.array(told), halves, atol=5.1e-5, rtol=0)
+    assert [*json.loads(lines[0])][-2:] == ["trajectories", "covariances"]
+    assert b"covariances" not in json_lines(replace(forecasts, covariances=None))

@@ -276,6 +276,23 @@ def test_a_replayed_file_is_what_the_service_said(tmp_path: Path) -> None:
     assert head["agents"]["error_m"][stayed[0]][0] == pytest.approx(0.0, abs=0.01)
 
 
+def test_a_replayed_file_tells_how_far_off_a_path_may_be(tmp_path: Path) -> None:
+    path, said = tmp_path / "some.jsonl", crowd(0, 3)
+    spread = np.tile(4.0 * np.eye(2), (*said.trajectories.shape[:3], 1, 1))
+    spread[1] = np.nan  # of a target that physics predicts
+    path.write_bytes(json_lines(replace(said, covariances=spread)))
+    (found,) = (record for record in read_records(path) if isinstance(record, ForecastSet))
+    assert found.covariances is not None
+    np.testing.assert_array_equal(found.covariances, spread)
+    head, _ = decode_update(Watch().update(found))
+    ellipses = np.array(head["agents"]["ellipses"], float)
+    assert np.isnan(ellipses[1]).all()
+    assert (ellipses[[0, 2], :, :2] > 0.0).all()
+    path.write_bytes(json_lines(replace(said, covariances=None)))
+    (unsure,) = (record for record in read_records(path) if isinstance(record, ForecastSet))
+    assert unsure.covariances is None
+
+
 def test_a_recording_is_what_the_service_said_of_itself_too(tmp_path: Path) -> None:
     """A real service's, two seconds of it: the folder, and each of its files."""
     folder = tmp_path / "recorded"
@@ -318,5 +335,9 @@ def test_a_file_that_cannot_be_watched_is_refused_in_one_line(
 def test_a_cycle_whose_lines_do_not_fit_together_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     path.write_bytes(json_lines(crowd(0, 2)) + json_lines(replace(one_car(), cycle=0)))
+    with pytest.raises(LogError, match="cycle 0 cannot be used"):
+        list(read_records(path))
+    longer = b'"covariances":[[[1.0,0.0,1.0],['
+    path.write_bytes(json_lines(crowd(0, 1)).replace(b'"covariances":[[[', longer))
     with pytest.raises(LogError, match="cycle 0 cannot be used"):
         list(read_records(path))

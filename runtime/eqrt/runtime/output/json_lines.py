@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from eqrt.runtime.output.forecasts import ForecastSet, Mode
 
-_MILLI, _MICRO = 1_000.0, 1_000_000.0
+_MILLI, _SQUARE_CENTI, _MICRO = 1e3, 1e4, 1e6
 _ENCODER = msgspec.json.Encoder()
+
+Covariances = list[list[tuple[float, float, float]]] | None
+"""(K, H, 3) xx, xy and yy in square metres, map axes; null = the trajectory is not the model's."""
 
 
 class Line(msgspec.Struct):
@@ -32,10 +35,14 @@ class Line(msgspec.Struct):
     velocity: list[float | None]  # null = not known
     probabilities: list[float]  # (K,) most probable mode first
     trajectories: list[list[list[float]]]  # (K, H, 2) at anchor_s + dt_s, + 2 dt_s ...
+    covariances: Covariances | msgspec.UnsetType = msgspec.UNSET  # not of a model without
 
 
 def json_lines(forecasts: ForecastSet) -> bytes:
-    """A line per target, rounded to 1 mm, 1 mm/s, 1 us and a millionth; empty without targets."""
+    """A line per target, rounded to 1 mm, 1 mm/s, 1 us and a millionth; empty without targets.
+
+    Covariances are rounded to 1 square centimetre.
+    """
     cycle = (
         forecasts.cycle,
         round(forecasts.timestamp_s, 6),
@@ -54,9 +61,19 @@ def json_lines(forecasts: ForecastSet) -> bytes:
         _rounded(forecasts.velocity, _MILLI),
         _rounded(forecasts.probabilities, _MICRO),
         _rounded(forecasts.trajectories, _MILLI),
+        _covariances(forecasts),
         strict=True,
     )
     return b"".join(_ENCODER.encode(Line(*cycle, *values)) + b"\n" for values in columns)
+
+
+def _covariances(forecasts: ForecastSet) -> list[Any]:
+    if forecasts.covariances is None:
+        return [msgspec.UNSET] * forecasts.num_targets
+    finite = np.isfinite(forecasts.covariances)
+    known: list[bool] = np.all(finite, axis=(1, 2, 3, 4)).tolist()
+    told = _rounded(forecasts.covariances[..., [0, 0, 1], [0, 1, 1]], _SQUARE_CENTI)
+    return [values if is_known else None for values, is_known in zip(told, known, strict=True)]
 
 
 def _rounded(values: NDArray[np.float64], steps_per_unit: float) -> list[Any]:

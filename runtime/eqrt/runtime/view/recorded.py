@@ -146,12 +146,25 @@ def _forecast(
             history_valid=histories[1],
             trajectories=trajectories,
             probabilities=np.array([line.probabilities for line in lines]).reshape(count, -1),
+            covariances=_covariances(lines, trajectories.shape),
         )
     except (ValueError, KeyError) as error:
         raise LogError(
             f"{path}: cycle {first.cycle} cannot be used ({error}); make the file again with "
             "`eqrt replay`"
         ) from error
+
+
+def _covariances(lines: list[Line], shape: tuple[int, ...]) -> NDArray[np.float64] | None:
+    """Of trajectories of this shape; NaN where not known, None of a model that predicts none."""
+    if all(line.covariances is msgspec.UNSET for line in lines):
+        return None
+    covariances = np.full((*shape, 2), math.nan)
+    for row, line in enumerate(lines):
+        if line.covariances:
+            xx, xy, yy = np.array(line.covariances).transpose(2, 0, 1)
+            covariances[row] = np.stack([xx, xy, xy, yy], -1).reshape(covariances.shape[1:])
+    return covariances
 
 
 class _Past:
