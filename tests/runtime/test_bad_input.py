@@ -16,6 +16,7 @@ from eqrt.cli import main
 from eqrt.runtime.bus.buses import LOCAL
 from eqrt.runtime.decoding import profile as profiles
 from eqrt.runtime.prediction.predictor import DEFAULT_ARTIFACT
+from own_network import own_network
 from processes import environment, eqrt
 from source_tree import ROOT
 
@@ -278,9 +279,6 @@ def test_a_full_disk_is_said(capfd: pytest.CaptureFixture[str]) -> None:
 )
 def test_a_local_bus_that_cannot_be_had_is_explained(prepare: str, said: str) -> None:
     """In a network of its own: without loopback, and with a program that keeps the port."""
-    namespace = ["unshare", "--user", "--map-root-user", "--net"]
-    if subprocess.run([*namespace, "true"], capture_output=True, check=False).returncode:
-        pytest.skip("this machine gives no network namespaces")
     program = f"""
 import fcntl, socket, struct, sys
 from eqrt.cli import main
@@ -292,7 +290,7 @@ taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 sys.exit(main(["serve", "--can", "c", "--can-interface", "{LOCAL}", "--profile", "ars408"]))
 """
     done = subprocess.run(
-        [*namespace, sys.executable, "-c", program],
+        [*own_network(), sys.executable, "-c", program],
         capture_output=True,
         text=True,
         check=False,

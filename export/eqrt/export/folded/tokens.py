@@ -52,7 +52,7 @@ class PointMeans(Fixed):
         """
         ask, count = self.get_buffer("ask"), points.shape[2]
         queries = (points.unsqueeze(1).transpose(2, 3) @ ask).flatten(1, 2)  # (B, heads P, 3)
-        keys = _only_existing(points, valid.to(points.dtype))
+        keys = _keys(points, valid.to(points.dtype))
         x, y = points[:, 0].unsqueeze(2), points[:, 1].unsqueeze(2)  # (B, P, 1)
         means: tuple[list[Tensor], list[Tensor]] = ([], [])
         for some in torch.split(queries, QUERIES, 1):
@@ -143,7 +143,7 @@ class FoldedTransformer(Fixed):
         return functional.layer_norm(tokens, shape, of("scale"), of("shift"), self.eps[1])
 
 
-def _only_existing(points: Tensor, valid: Tensor) -> Tensor:
+def _keys(points: Tensor, valid: Tensor) -> Tensor:
     """Keys (B, 3, P) of points (B, 3, P), 0 where not valid (B, 1, P), and the last coordinate 1.
 
     What does not exist lies at the middle of what does, which no query prefers to all of that, and

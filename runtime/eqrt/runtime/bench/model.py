@@ -15,7 +15,14 @@ import numpy as np
 from eqrt.core.errors import EqrtError
 from eqrt.runtime.bench.cold_start import measure_cold_start
 from eqrt.runtime.bench.environment import Environment, ModelIdentity, read_environment
-from eqrt.runtime.bench.measure import clock_went_back, measure, punctuality, results, warm_up
+from eqrt.runtime.bench.measure import (
+    Measurement,
+    clock_went_back,
+    measure,
+    punctuality,
+    results,
+    warm_up,
+)
 from eqrt.runtime.bench.predictors import (
     ModelWorkload,
     TimedPredictor,
@@ -119,11 +126,7 @@ def measure_case(
     resources = watch.finish()
     found = results(loads, measured)
     kept = None if settings.rate_hz is None else punctuality(measured, settings.rate_hz)
-    slow = (
-        ()
-        if recurring is None
-        else slow_scenes(measured.turns[:, 0], measured.stages_ns[0].sum(axis=1), recurring)
-    )
+    slow = _slow_scenes(measured, recurring) if recurring else ()
     return Case(
         targets=targets,
         seconds=round(seconds, 3),
@@ -135,6 +138,11 @@ def measure_case(
         ),
         advice=(*advice(settings, environment, found[0], kept, resources), *slow),
     )
+
+
+def _slow_scenes(measured: Measurement, scenes: int) -> Iterator[str]:
+    """Of the workload that is judged."""
+    return slow_scenes(measured.turns[:, 0], measured.stages_ns[0].sum(axis=1), scenes)
 
 
 def _beside_one_thread(

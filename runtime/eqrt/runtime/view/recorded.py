@@ -162,8 +162,8 @@ def _covariances(lines: list[Line], shape: tuple[int, ...]) -> NDArray[np.float6
     covariances = np.full((*shape, 2), math.nan)
     for row, line in enumerate(lines):
         if line.covariances:
-            xx, xy, yy = np.array(line.covariances).transpose(2, 0, 1)
-            covariances[row] = np.stack([xx, xy, xy, yy], -1).reshape(covariances.shape[1:])
+            whole = np.array(line.covariances)[..., [0, 1, 1, 2]]  # xx, xy, yx, yy
+            covariances[row] = whole.reshape(covariances.shape[1:])
     return covariances
 
 
